@@ -1,0 +1,1 @@
+"""Environment families, one a file; each module maps names to classes in ENVIRONMENTS."""

@@ -1,0 +1,185 @@
+"""Point robots in the plane: a goal on the half circle (dense or sparse reward), or a wind to resist.
+
+Definitions follow the field's code (PEARL, FOCAL, IDAQ); the robot starts at the origin and an action
+moves it by at most 0.1 per axis.
+"""
+
+from collections.abc import Sequence
+from typing import Any, Literal, final
+
+import gymnasium
+import numpy as np
+from pydantic import Field
+
+from tcmrl_data.environment import (
+    Controller,
+    Environment,
+    EnvironmentSettings,
+    Lanes,
+    LaneStep,
+    Parameters,
+    View,
+)
+from tcmrl_data.trajectory import BoolArray, FloatArray
+
+STEP_SIZE = 0.1
+
+
+class PointRobotSettings(EnvironmentSettings):
+    """Settings of the point robots.
+
+    Attributes:
+        goal_radius: distance within which the sparse reward is paid (published code: 0.2).
+        sparse_reward: `distance` pays 1 - dist inside the radius (paper, Appendix D),
+            `normalized` pays 1 - dist / radius (published code).
+        wind_limit: wind is uniform in [-limit, limit] per axis (published code: 0.05).
+    """
+
+    goal_radius: float = Field(default=0.2, gt=0)
+    sparse_reward: Literal["distance", "normalized"] = "distance"
+    wind_limit: float = Field(default=0.05, ge=0)
+
+
+class _PointRobot(Environment):
+    """What the three point robots share: planar motion, stepped as one NumPy batch."""
+
+    Settings = PointRobotSettings
+    observation_dim = 2
+    action_dim = 2
+    settings: PointRobotSettings
+
+    def rewards(self, distances: FloatArray, reward: Literal["stored", "dense"]) -> FloatArray:
+        """Rewards (...,) for distances to the goal (...,) after the move."""
+        return -distances
+
+    def make(
+        self, parameters: Parameters, *, view: View = "stored", reward: Literal["stored", "dense"] = "stored"
+    ) -> "PointRobotEnv":
+        return PointRobotEnv(PointRobotLanes(self, [parameters], reward))
+
+    def lanes(self, parameters: Sequence[Parameters]) -> "PointRobotLanes":
+        return PointRobotLanes(self, parameters, "stored")
+
+    def oracle(self, parameters: Sequence[Parameters]) -> "GreedyController":
+        return GreedyController(*goals_and_winds(parameters))
+
+
+@final
+class PointRobot(_PointRobot):
+    """Goals spread over the half circle, dense reward -dist."""
+
+    def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
+        return half_circle_goals(num_tasks)
+
+
+@final
+class SparsePointRobot(_PointRobot):
+    """Goals spread over the half circle, reward only near the goal."""
+
+    def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
+        return half_circle_goals(num_tasks)
+
+    def rewards(self, distances: FloatArray, reward: Literal["stored", "dense"]) -> FloatArray:
+        if reward == "dense":
+            return -distances
+        radius = self.settings.goal_radius
+        scale = radius if self.settings.sparse_reward == "normalized" else 1.0
+        return np.where(distances <= radius, 1.0 - distances / scale, 0.0)
+
+
+@final
+class PointRobotWind(_PointRobot):
+    """One goal at (1, 0); each task has a wind that shifts every step."""
+
+    def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
+        random = np.random.RandomState(task_seed)  # the field's generator: all x first, then all y
+        limit = self.settings.wind_limit
+        winds = [random.uniform(-limit, limit, num_tasks) for _ in range(2)]
+        return [{"goal": [1.0, 0.0], "wind": [float(x), float(y)]} for x, y in zip(*winds, strict=True)]
+
+
+def half_circle_goals(num_tasks: int) -> list[dict[str, Any]]:
+    """Goals (cos a, sin a) at angles linspace(0, pi, num_tasks), without wind."""
+    angles = np.linspace(0.0, np.pi, num_tasks)
+    return [{"goal": [float(np.cos(a)), float(np.sin(a))], "wind": [0.0, 0.0]} for a in angles]
+
+
+def goals_and_winds(parameters: Sequence[Parameters]) -> tuple[FloatArray, FloatArray]:
+    """Goals and winds of several tasks, each (tasks, 2)."""
+    return (
+        np.array([each["goal"] for each in parameters], dtype=np.float64),
+        np.array([each["wind"] for each in parameters], dtype=np.float64),
+    )
+
+
+@final
+class GreedyController(Controller):
+    """Moves each axis as far towards the goal as one step allows, wind included; needs no noise."""
+
+    def __init__(self, goals: FloatArray, winds: FloatArray) -> None:
+        self._targets = goals - winds
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        return np.clip((self._targets - observations) / STEP_SIZE, -1.0, 1.0)
+
+
+@final
+class PointRobotLanes(Lanes):
+    """Any number of point robots as one NumPy batch."""
+
+    def __init__(
+        self, environment: _PointRobot, parameters: Sequence[Parameters], reward: Literal["stored", "dense"]
+    ) -> None:
+        self.num_lanes = len(parameters)
+        self._environment, self._reward = environment, reward
+        self._goals, self._winds = goals_and_winds(parameters)
+        self._positions = np.zeros((self.num_lanes, 2))
+        self._steps = np.zeros(self.num_lanes, dtype=np.int64)
+
+    def reset(self, seeds: Sequence[int]) -> FloatArray:
+        self._positions[:] = 0.0
+        self._steps[:] = 0
+        return self._positions.copy()
+
+    def step(self, actions: FloatArray, active: BoolArray) -> LaneStep:
+        moves = STEP_SIZE * np.asarray(actions, dtype=np.float64) + self._winds
+        self._positions[active] += moves[active]
+        self._steps += active
+        distances = np.linalg.norm(self._positions - self._goals, axis=-1)
+        rewards = np.where(active, self._environment.rewards(distances, self._reward), 0.0)
+        truncated = active & (self._steps >= self._environment.settings.horizon)
+        return LaneStep(self._positions.copy(), rewards, np.zeros_like(truncated), truncated, {})
+
+
+@final
+class PointRobotEnv(gymnasium.Env[FloatArray, FloatArray]):
+    """One lane under Gymnasium's interface."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def __init__(self, lanes: PointRobotLanes) -> None:
+        self._lanes = lanes
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[FloatArray, dict[str, Any]]:
+        super().reset(seed=seed)
+        return self._lanes.reset([0])[0], {}
+
+    def step(self, action: FloatArray) -> tuple[FloatArray, float, bool, bool, dict[str, Any]]:
+        step = self._lanes.step(np.clip(action, -1.0, 1.0)[None], np.ones(1, dtype=bool))
+        return (
+            step.observations[0],
+            float(step.rewards[0]),
+            bool(step.terminated[0]),
+            bool(step.truncated[0]),
+            {},
+        )
+
+
+ENVIRONMENTS: dict[str, type[Environment]] = {
+    "point-robot": PointRobot,
+    "point-robot-wind": PointRobotWind,
+    "sparse-point-robot": SparsePointRobot,
+}

@@ -1,0 +1,80 @@
+"""Tasks of an environment: indices, parameters, and the split that never moves."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from tcmrl_data.environment import Environment
+from tcmrl_data.errors import TaskError
+from tcmrl_data.seeding import NO_TASK, Purpose, keyed_generator
+
+Split = Literal["train", "test"]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One member of an environment.
+
+    Attributes:
+        index: position in the full task set; means the same task in every profile and selection.
+        split: `train` or `test`.
+        parameters: JSON values that rebuild the task without drawing anything again.
+    """
+
+    index: int
+    split: Split
+    parameters: Mapping[str, Any]
+
+
+def draw_tasks(environment: Environment) -> tuple[Task, ...]:
+    """All tasks of an environment, a function of its settings alone (its `task_seed`, never `--seed`)."""
+    settings = environment.settings
+    parameters = environment.draw_parameters(settings.tasks, settings.task_seed)
+    permutation = keyed_generator(
+        settings.task_seed, environment.name, NO_TASK, Purpose.SPLIT
+    ).permutation(settings.tasks)
+    train = set(permutation[: settings.train].tolist())
+    return tuple(
+        Task(index, "train" if index in train else "test", parameters[index])
+        for index in range(settings.tasks)
+    )
+
+
+def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]:
+    """Indices of `num_train` training and `num_test` test tasks, each evenly spaced within its split.
+
+    The first and the last task of each split are taken, so that a smaller selection spans the same range.
+
+    Raises:
+        TaskError: a split has fewer tasks than asked for.
+    """
+    chosen: list[int] = []
+    for split, number in (("train", num_train), ("test", num_test)):
+        members = [task.index for task in tasks if task.split == split]
+        if number > len(members):
+            raise TaskError(f"{number} {split} tasks asked for, the task set has {len(members)}")
+        positions = np.linspace(0, len(members) - 1, number).round().astype(int)
+        chosen.extend(members[position] for position in positions)
+    return sorted(chosen)
+
+
+def parse_indices(text: str, num_tasks: int) -> list[int]:
+    """Indices named by text such as `0-9,12`, sorted.
+
+    Raises:
+        TaskError: the text is no list of indices and ranges, or an index lies outside the task set.
+    """
+    indices: set[int] = set()
+    for item in text.split(","):
+        first, dash, last = item.strip().partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise TaskError(f"--tasks {text!r}: {item!r} is neither an index nor a range such as 0-9")
+        start, stop = int(first), int(last or first)
+        if stop < start:
+            raise TaskError(f"--tasks {text!r}: the range {item!r} runs backwards")
+        if stop >= num_tasks:
+            raise TaskError(f"--tasks {text!r}: index {stop} does not exist, the tasks are 0-{num_tasks - 1}")
+        indices.update(range(start, stop + 1))
+    return sorted(indices)
