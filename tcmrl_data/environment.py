@@ -1,6 +1,7 @@
 """What an environment is: settings, task parameters, a Gymnasium environment, and lanes stepped together."""
 
 import abc
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, final
@@ -219,4 +220,4 @@ def environment_type(name: str) -> type[Environment]:
 def make_environment(settings: Mapping[str, Any]) -> Environment:
     """The environment of a validated `[environment]` table (raises pydantic's error for a bad one)."""
     kind = environment_type(settings["name"])
-    return kind(kind.Settings.model_validate(settings))
+    return kind(kind.Settings.model_validate_json(json.dumps(settings)))

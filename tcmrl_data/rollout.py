@@ -8,7 +8,7 @@ from tcmrl_data.environment import Controller, Environment, Lanes
 from tcmrl_data.trajectory import Trajectory
 
 
-def rollout(
+def roll_out(
     environment: Environment,
     lanes: Lanes,
     controller: Controller,

@@ -8,6 +8,7 @@ import numpy as np
 
 from tcmrl_data.environment import Environment
 from tcmrl_data.errors import TaskError
+from tcmrl_data.recipe import Recipe
 from tcmrl_data.seeding import NO_TASK, Purpose, keyed_generator
 
 Split = Literal["train", "test"]
@@ -58,6 +59,25 @@ def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]
         positions = np.linspace(0, len(members) - 1, number).round().astype(int)
         chosen.extend(members[position] for position in positions)
     return sorted(chosen)
+
+
+def choose_tasks(recipe: Recipe, indices: Sequence[int] | None = None) -> list[Task]:
+    """The named tasks, or those that the recipe's profile chooses, ascending.
+
+    Raises:
+        TaskError: an index outside the task set, or a profile that asks for more tasks than there are.
+    """
+    tasks = draw_tasks(recipe.make_environment())
+    if indices is None:
+        num_train, num_test = (
+            sum(task.split == split for task in tasks) if asked is None else asked
+            for split, asked in (("train", recipe.build.train_tasks), ("test", recipe.build.test_tasks))
+        )
+        indices = spread(tasks, num_train=num_train, num_test=num_test)
+    for index in indices:
+        if not 0 <= index < len(tasks):
+            raise TaskError(f"task index {index} does not exist, the tasks are 0-{len(tasks) - 1}")
+    return [tasks[index] for index in sorted(set(indices))]
 
 
 def parse_indices(text: str, num_tasks: int) -> list[int]:

@@ -1,0 +1,48 @@
+"""Behavior sources, one a file: each has NAME, a Settings class, and a Source that yields snapshots."""
+
+import abc
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+from tcmrl_data.environment import Environment, View
+from tcmrl_data.snapshot import Snapshot
+from tcmrl_data.tasks import Task
+
+
+@dataclass(frozen=True)
+class BehaviorContext:
+    """What a source needs to make the behavior policies of a unit.
+
+    Attributes:
+        environment: the environment whose tasks are trained on.
+        tasks: the unit's tasks.
+        seed: root seed of the build.
+        observation: view that the policies see.
+        reward: reward that the policies learn from.
+        report: called with the number of environment steps done since the last call.
+    """
+
+    environment: Environment
+    tasks: Sequence[Task]
+    seed: int
+    observation: View
+    reward: str
+    report: Callable[[int], None]
+
+
+class BehaviorSource(abc.ABC):
+    """Makes the behavior policies of tasks; `settings` is an instance of the module's Settings."""
+
+    @property
+    @abc.abstractmethod
+    def steps(self) -> tuple[int, ...]:
+        """The snapshot steps, ascending."""
+
+    @property
+    @abc.abstractmethod
+    def training_steps(self) -> int:
+        """Environment steps of behavior training per task."""
+
+    @abc.abstractmethod
+    def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
+        """Yields every (task, snapshot) of the unit, each task's in ascending order of steps."""

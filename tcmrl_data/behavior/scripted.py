@@ -1,0 +1,51 @@
+"""The environment's own expert with Gaussian noise; several noise levels stand in for snapshots."""
+
+from collections.abc import Iterator
+from typing import final
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from tcmrl_data.behavior import BehaviorContext, BehaviorSource
+from tcmrl_data.snapshot import ScriptedPolicy, Snapshot
+from tcmrl_data.tasks import Task
+
+NAME = "scripted"
+
+
+class Settings(BaseModel):
+    """The `[behavior.scripted]` table.
+
+    Attributes:
+        noise: standard deviations, noisiest first; the n-th is snapshot step n.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    noise: tuple[float, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _noisiest_first(self) -> "Settings":
+        if list(self.noise) != sorted(set(self.noise), reverse=True) or min(self.noise) < 0:
+            raise ValueError(f"noise must fall from noisiest to cleanest, got {list(self.noise)}")
+        return self
+
+
+@final
+class Source(BehaviorSource):
+    """Experts need no training; they always see the full observation."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._noise = settings.noise
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        return tuple(range(len(self._noise)))
+
+    @property
+    def training_steps(self) -> int:
+        return 0
+
+    def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
+        for task in context.tasks:
+            for step, noise in enumerate(self._noise):
+                yield task, Snapshot(step, ScriptedPolicy(observation="full", noise=noise))

@@ -1,0 +1,293 @@
+"""What one worker does: train a unit's behavior policies, roll them out, publish each part. Idempotent."""
+
+import datetime
+import platform
+import socket
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tcmrl_data.behavior import BehaviorContext, BehaviorSource
+from tcmrl_data.canonical import canonical_json, digest, sha256
+from tcmrl_data.discovery import plugin
+from tcmrl_data.environment import Controller, Environment, Lanes, UniformController
+from tcmrl_data.errors import NondeterminismError
+from tcmrl_data.manifest import (
+    DATA_VERSION,
+    SCHEMA_VERSION,
+    ArrayRecord,
+    FileRecord,
+    Identity,
+    PartRecord,
+    References,
+    Statistics,
+    part_folder,
+    read_part_record,
+)
+from tcmrl_data.publish import publish_folder, stage, sync_tree, write_file
+from tcmrl_data.recipe import Recipe
+from tcmrl_data.rollout import roll_out
+from tcmrl_data.seeding import Purpose, keyed_generator, keyed_seed
+from tcmrl_data.snapshot import Snapshot
+from tcmrl_data.store import array_digests, pack, write_arrays
+from tcmrl_data.tasks import Task
+from tcmrl_data.trajectory import Trajectory
+
+PACKAGES = ("tcmrl", "numpy", "torch", "stable-baselines3", "gymnasium", "mujoco", "metaworld", "zarr")
+QUANTILES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
+
+Report = Callable[[Mapping[str, Any]], None]
+"""Receives `{"kind": "steps", "count"}` and `{"kind": "part", "task", "step", "id"}`."""
+
+
+@dataclass(frozen=True)
+class UnitSpec:
+    """What a worker is told; JSON both ways.
+
+    Attributes:
+        dataset: folder of the dataset.
+        recipe: the resolved recipe.
+        seed: root seed of the build.
+        tasks: the unit's tasks.
+    """
+
+    dataset: Path
+    recipe: Recipe
+    seed: int
+    tasks: tuple[Task, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON form."""
+        return {
+            "dataset": str(self.dataset),
+            "recipe": self.recipe.model_dump(mode="json"),
+            "seed": self.seed,
+            "tasks": [[task.index, task.split, dict(task.parameters)] for task in self.tasks],
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "UnitSpec":
+        """The inverse of `to_json`."""
+        recipe = Recipe.model_validate_json(canonical_json(values["recipe"]))
+        tasks = tuple(Task(index, split, parameters) for index, split, parameters in values["tasks"])
+        return cls(Path(values["dataset"]), recipe, values["seed"], tasks)
+
+
+def behavior_source(recipe: Recipe) -> BehaviorSource:
+    """The recipe's behavior source with its settings."""
+    module = plugin("tcmrl_data.behavior", "behavior source", recipe.behavior["source"])
+    source: BehaviorSource = module.Source(
+        module.Settings.model_validate_json(canonical_json(recipe.behavior["settings"]))
+    )
+    return source
+
+
+def run_unit(spec: UnitSpec, report: Report) -> str:
+    """Makes every missing part of the unit's tasks; parts already published are left alone.
+
+    Returns:
+        A digest over the ids of the unit's parts.
+
+    Raises:
+        NondeterminismError: a published part of the same task and step has another id.
+    """
+    environment = spec.recipe.make_environment()
+    context = BehaviorContext(
+        environment=environment,
+        tasks=spec.tasks,
+        seed=spec.seed,
+        observation=spec.recipe.behavior["observation"],
+        reward=spec.recipe.behavior["reward"],
+        report=lambda count: report({"kind": "steps", "count": count}),
+    )
+    ids = []
+    roller: _TaskRoller | None = None
+    for task, snapshot in behavior_source(spec.recipe).snapshots(context):
+        if roller is None or roller.task != task:
+            if roller is not None:
+                roller.close()
+            roller = _TaskRoller(spec, environment, task)
+        ids.append(roller.publish(snapshot, report))
+    if roller is not None:
+        roller.close()
+    return digest(ids)
+
+
+class _TaskRoller:
+    """Rolls out and publishes the snapshots of one task, with one set of lanes."""
+
+    def __init__(self, spec: UnitSpec, environment: Environment, task: Task) -> None:
+        self.task = task
+        self._spec, self._environment = spec, environment
+        self._parameters = [task.parameters] * spec.recipe.rollouts.lanes
+        self._lanes: Lanes | None = None
+        self._references: References | None = None
+
+    def close(self) -> None:
+        if self._lanes is not None:
+            self._lanes.close()
+
+    def publish(self, snapshot: Snapshot, report: Report) -> str:
+        """Publishes the part of a snapshot and returns its id."""
+        dataset = self._spec.dataset
+        target = dataset / part_folder(self.task.index, snapshot.step)
+        if (target / "part.json").is_file():
+            record = read_part_record(target / "part.json")
+            if record.identity.policy != snapshot.digest():
+                raise NondeterminismError(f"{target}: its policy differs from the one trained now with the same seed")
+            return record.id
+        with stage(dataset, f"task_{self.task.index:05d}") as staged:
+            part_id = self._write(staged, snapshot)
+            sync_tree(staged)
+            if not publish_folder(staged, target):
+                published = read_part_record(target / "part.json").id
+                if published != part_id:
+                    raise NondeterminismError(f"{target}: published with id {published}, made again with {part_id}")
+        report({"kind": "part", "task": self.task.index, "step": snapshot.step, "id": part_id})
+        return part_id
+
+    def _write(self, folder: Path, snapshot: Snapshot) -> str:
+        environment, spec = self._environment, self._spec
+        if self._lanes is None:
+            self._lanes = environment.lanes(self._parameters)
+        trajectories = roll_out_part(spec, environment, self.task, snapshot, self._lanes)
+        if self._references is None:
+            self._references = self._measure_references()
+        arrays = pack(trajectories)
+        write_arrays(folder, arrays)
+        for name, content in snapshot.files().items():
+            write_file(folder / name, content)
+        identity = Identity(
+            schema_version=SCHEMA_VERSION,
+            data_version=DATA_VERSION,
+            settings=spec.recipe.unit_settings(),
+            task=self.task.index,
+            parameters=dict(self.task.parameters),
+            step=snapshot.step,
+            seed=spec.seed,
+            policy=snapshot.digest(),
+            arrays={name: ArrayRecord.model_validate_json(canonical_json(each)) for name, each in array_digests(arrays).items()},
+        )
+        record = PartRecord(
+            schema_version=SCHEMA_VERSION,
+            id=digest(identity.model_dump(mode="json")),
+            identity=identity,
+            statistics=statistics(trajectories),
+            references=self._references,
+            files=file_records(folder),
+            provenance=provenance(environment),
+        )
+        write_file(folder / "part.json", canonical_json(record.model_dump(mode="json")))
+        return record.id
+
+    def _measure_references(self) -> References:
+        """Uniform, oracle and noise-free scripted returns of the task, from one lane batch each."""
+        environment, lanes = self._environment, self._lanes
+        assert lanes is not None
+        key = (self._spec.seed, environment.name, self.task.index)
+        seeds = [keyed_seed(*key, Purpose.REFERENCE_RESET, lane) for lane in range(lanes.num_lanes)]
+
+        def mean_return(controller: Controller | None) -> float | None:
+            if controller is None:
+                return None
+            noise = [keyed_generator(*key, Purpose.REFERENCE_NOISE, lane) for lane in range(lanes.num_lanes)]
+            episodes = roll_out(environment, lanes, controller, reset_seeds=seeds, noise=noise)
+            return float(np.mean([each.undiscounted_return for each in episodes]))
+
+        uniform = mean_return(UniformController())
+        assert uniform is not None
+        return References(
+            uniform=uniform,
+            oracle=mean_return(environment.oracle(self._parameters)),
+            scripted=mean_return(environment.scripted(self._parameters, 0.0)),
+        )
+
+
+def roll_out_part(
+    spec: UnitSpec, environment: Environment, task: Task, snapshot: Snapshot, lanes: Lanes
+) -> list[Trajectory]:
+    """The recipe's episodes of one snapshot, in lane batches; each episode has its own keyed seeds."""
+    controller = snapshot.controller(environment, [task.parameters] * lanes.num_lanes)
+    return [
+        trajectory
+        for first in range(0, spec.recipe.rollouts.episodes, lanes.num_lanes)
+        for trajectory in _roll_out_batch(spec, environment, task, snapshot.step, lanes, controller, first)
+    ]
+
+
+def _roll_out_batch(
+    spec: UnitSpec,
+    environment: Environment,
+    task: Task,
+    step: int,
+    lanes: Lanes,
+    controller: Controller,
+    first: int,
+) -> Iterator[Trajectory]:
+    key = (spec.seed, environment.name, task.index)
+    episodes = range(first, first + lanes.num_lanes)
+    yield from roll_out(
+        environment,
+        lanes,
+        controller,
+        reset_seeds=[keyed_seed(*key, Purpose.ROLLOUT_RESET, step, episode) for episode in episodes],
+        noise=[keyed_generator(*key, Purpose.ROLLOUT_NOISE, step, episode) for episode in episodes],
+    )
+
+
+def statistics(trajectories: Sequence[Trajectory]) -> Statistics:
+    """Return statistics and mergeable moments of a part."""
+    returns = np.array([each.undiscounted_return for each in trajectories])
+    success = [bool(np.any(each.extras["success"])) for each in trajectories if "success" in each.extras]
+    moments = {}
+    for name in ("observations", "actions"):
+        rows = np.concatenate([getattr(each, name) for each in trajectories]).astype(np.float64)
+        moments[name] = {
+            "count": len(rows),
+            "sum": rows.sum(axis=0).tolist(),
+            "sum_of_squares": np.square(rows).sum(axis=0).tolist(),
+        }
+    return Statistics(
+        episodes=len(trajectories),
+        steps=sum(len(each) for each in trajectories),
+        mean=float(returns.mean()),
+        std=float(returns.std()),
+        min=float(returns.min()),
+        max=float(returns.max()),
+        quantiles=tuple(float(each) for each in np.quantile(returns, QUANTILES)),
+        success_rate=float(np.mean(success)) if success else None,
+        moments=moments,
+    )
+
+
+def file_records(folder: Path) -> dict[str, FileRecord]:
+    """Size and sha256 of every file below a folder."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {
+        path.relative_to(folder).as_posix(): FileRecord(size=path.stat().st_size, sha256=sha256(path.read_bytes()))
+        for path in files
+    }
+
+
+def provenance(environment: Environment) -> dict[str, Any]:
+    """Where, when and with what a part was made."""
+    return {
+        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "host": socket.gethostname(),
+        "platform": platform.platform(),
+        "cpu": _cpu_model(),
+        "python": platform.python_version(),
+        "packages": {name: version(name) for name in PACKAGES},
+        "physics": environment.fingerprint(),
+    }
+
+
+def _cpu_model() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor()
