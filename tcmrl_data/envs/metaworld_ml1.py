@@ -1,0 +1,179 @@
+"""Meta-World ML1: one manipulation task set each, fifty hidden goals and object positions.
+
+`ml1/<task-set>` is Meta-World's `<task-set>-v3` (the paper's names end in -v2). A task is one of the fifty
+`ML1(<task-set>-v3, seed=task_seed).train_tasks`, defined by its random vector. The goal is the last three of
+the 39 observation values: policies may see it (view `full`), storage and the meta-learner see zeros.
+Reward and dynamics do not depend on what is shown.
+"""
+
+import functools
+import pickle
+import warnings
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal, final
+
+import gymnasium
+import numpy as np
+from pydantic import Field
+
+from tcmrl_data.environment import Controller, Environment, EnvironmentSettings, Parameters, View
+from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint
+from tcmrl_data.errors import TaskError
+from tcmrl_data.trajectory import FloatArray
+
+GOAL = slice(-3, None)
+TASKS_PER_SET = 50
+TASK_SETS = (
+    "assembly", "basketball", "bin-picking", "box-close", "button-press", "button-press-topdown",
+    "button-press-topdown-wall", "button-press-wall", "coffee-button", "coffee-pull", "coffee-push",
+    "dial-turn", "disassemble", "door-close", "door-lock", "door-open", "door-unlock", "drawer-close",
+    "drawer-open", "faucet-close", "faucet-open", "hammer", "hand-insert", "handle-press",
+    "handle-press-side", "handle-pull", "handle-pull-side", "lever-pull", "peg-insert-side",
+    "peg-unplug-side", "pick-out-of-hole", "pick-place", "pick-place-wall", "plate-slide",
+    "plate-slide-back", "plate-slide-back-side", "plate-slide-side", "push", "push-back", "push-wall",
+    "reach", "reach-wall", "shelf-place", "soccer", "stick-pull", "stick-push", "sweep", "sweep-into",
+    "window-close", "window-open",
+)  # fmt: skip
+"""The task sets, spelled out so that listing environments does not import Meta-World."""
+
+
+class MetaWorldML1Settings(EnvironmentSettings):
+    """Settings of ML1.
+
+    Attributes:
+        tasks: at most the fifty training tasks that ML1 draws per task set.
+    """
+
+    tasks: int = Field(ge=3, le=TASKS_PER_SET)
+
+
+@final
+class MetaWorldML1(Environment):
+    """One ML1 task set; episodes end at the horizon only; `success` is Meta-World's, per step."""
+
+    Settings = MetaWorldML1Settings
+    observation_dim = 39
+    action_dim = 4
+    extras: ClassVar = {"success": np.bool_}
+
+    def __init__(self, settings: EnvironmentSettings) -> None:
+        super().__init__(settings)
+        self._env_name = f"{self.name.removeprefix('ml1/')}-v3"
+
+    def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
+        vectors = _random_vectors(self._env_name, task_seed)[:num_tasks]
+        return [
+            {"env_name": self._env_name, "rand_vec": list(each), "partially_observable": True}
+            for each in vectors
+        ]
+
+    def make(
+        self, parameters: Parameters, *, view: View = "stored", reward: Literal["stored", "dense"] = "stored"
+    ) -> "MetaWorldML1Task":
+        if parameters["env_name"] != self._env_name:
+            raise TaskError(
+                f"{self.name}: a task of {parameters['env_name']!r} is no task of this environment"
+            )
+        return MetaWorldML1Task(parameters, view=view, horizon=self.settings.horizon)
+
+    def stored_view(self, observations: FloatArray) -> FloatArray:
+        hidden = observations.copy()
+        hidden[..., GOAL] = 0.0
+        return hidden
+
+    def scripted(self, parameters: Sequence[Parameters], noise: float) -> "ExpertController":
+        return ExpertController([each["env_name"] for each in parameters], noise)
+
+    def fingerprint(self) -> dict[str, Any]:
+        from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+
+        simulator: Any = ALL_V3_ENVIRONMENTS[self._env_name]()
+        try:
+            return simulation_fingerprint(simulator, "metaworld")
+        finally:
+            simulator.close()
+
+
+@functools.cache
+def _random_vectors(env_name: str, task_seed: int) -> tuple[tuple[float, ...], ...]:
+    """The random vectors of ML1's training tasks; constructing ML1 resets a simulator 100 times."""
+    import metaworld
+
+    benchmark: Any = metaworld.ML1
+    # the pickles are Meta-World's own, made in this process a moment ago
+    drawn = [pickle.loads(task.data) for task in benchmark(env_name, seed=task_seed).train_tasks]
+    return tuple(tuple(float(value) for value in each["rand_vec"]) for each in drawn)
+
+
+@final
+class MetaWorldML1Task(SimulatedTask):
+    """One goal of a task set."""
+
+    def __init__(self, parameters: Parameters, *, view: View, horizon: int) -> None:
+        super().__init__(
+            _simulator(parameters, horizon),
+            horizon=horizon,
+            observation_dim=MetaWorldML1.observation_dim,
+            action_dim=MetaWorldML1.action_dim,
+        )
+        self._hides_goal = view == "stored"
+
+    def observe(self, observation: FloatArray) -> FloatArray:
+        shown = observation.copy()
+        if self._hides_goal:
+            shown[GOAL] = 0.0
+        return shown
+
+    def reward(self, action: FloatArray, simulator_reward: float, info: dict[str, Any]) -> float:
+        return simulator_reward
+
+    def extras(self, info: dict[str, Any]) -> dict[str, Any]:
+        return {"success": bool(info["success"])}
+
+
+def _simulator(parameters: Parameters, horizon: int) -> gymnasium.Env[Any, Any]:
+    """Meta-World's environment of a task, goal shown, without constructing the benchmark again."""
+    from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+    from metaworld.types import Task
+
+    kind = ALL_V3_ENVIRONMENTS[parameters["env_name"]]
+    task = {"env_cls": kind, "rand_vec": np.array(parameters["rand_vec"]), "partially_observable": False}
+    simulator = kind()
+    simulator.max_path_length = max(simulator.max_path_length, horizon)  # it raises past its own limit
+    simulator.set_task(Task(parameters["env_name"], pickle.dumps(task)))
+    return simulator
+
+
+@final
+class ExpertController(Controller):
+    """Meta-World's scripted experts, one per lane, plus N(0, noise) on every action, clipped to [-1, 1].
+
+    Args:
+        env_names: Meta-World's environment name per lane.
+        noise: standard deviation (published data: 0.1).
+    """
+
+    view: View = "full"
+
+    def __init__(self, env_names: Sequence[str], noise: float) -> None:
+        from metaworld.policies import ENV_POLICY_MAP
+
+        experts: dict[str, Any] = ENV_POLICY_MAP
+        self._experts = [experts[name]() for name in env_names]
+        self._noise = noise
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        with warnings.catch_warnings():
+            # experts ask for more than a full step on purpose, and warn of it at every step
+            warnings.filterwarnings("ignore", message="Constant")
+            actions = np.stack(
+                [
+                    expert.get_action(np.asarray(row, dtype=np.float64))
+                    for expert, row in zip(self._experts, observations, strict=True)
+                ]
+            )
+        clipped: FloatArray = np.clip(actions + self._noise * noise, -1.0, 1.0)
+        return clipped
+
+
+ENVIRONMENTS: dict[str, type[Environment]] = {f"ml1/{name}": MetaWorldML1 for name in TASK_SETS}

@@ -1,0 +1,158 @@
+"""Hopper- and Walker-Rand-Params: run forward with a body whose physics differ from task to task.
+
+A task multiplies every element of the nominal body masses, inertias, joint dampings and friction
+coefficients by base^U(-3, 3). The models are Gymnasium's Hopper-v5 and Walker2d-v5 (both feet of the walker
+with friction 1.9), which differ from the field's older models in two points that the settings decide:
+
+- Physics step. The older models act for 4 steps of 0.004 s, Gymnasium's for 4 of 0.002 s. The default is
+  0.004 s: horizon and published returns belong to it, and random actions stayed finite in all tasks.
+- Derived constants. MuJoCo keeps quantities computed from masses (inverse weights, which set how stiff
+  contacts and joint limits are). The default has `mj_setConst` recompute them for the scaled body; the
+  published code leaves those of the nominal one.
+"""
+
+import abc
+from collections.abc import Mapping
+from typing import Any, ClassVar, Literal, final
+
+import numpy as np
+from pydantic import Field
+
+from tcmrl_data.environment import Environment, EnvironmentSettings, Parameters, View
+from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint, squared_norm
+from tcmrl_data.errors import TaskError
+from tcmrl_data.trajectory import FloatArray
+
+ALIVE_BONUS = 1.0
+CONTROL_COST = 1e-3
+
+
+class RandParamsSettings(EnvironmentSettings):
+    """Settings of the randomised bodies.
+
+    Attributes:
+        multiplier_base: base of the multipliers of mass, inertia and friction (paper, Appendix D: 1.5).
+        damping_base: base of the damping multipliers (paper, Appendix D: 1.5; published code: 1.3).
+        log_scale_limit: exponents are uniform in [-limit, limit] (paper, Appendix D: 3).
+        timestep: seconds per physics step; an action lasts four (published code's models: 0.004,
+            Gymnasium's: 0.002).
+        constants: `recomputed` by mj_setConst after scaling, or `nominal` as in the published code.
+    """
+
+    multiplier_base: float = Field(default=1.5, gt=1)
+    damping_base: float = Field(default=1.5, gt=1)
+    log_scale_limit: float = Field(default=3.0, ge=0)
+    timestep: float = Field(default=0.004, gt=0, le=0.01)
+    constants: Literal["recomputed", "nominal"] = "recomputed"
+
+
+class _RandParams(Environment):
+    """What both robots share; `shapes` are those of the model's arrays, in the field's drawing order."""
+
+    Settings = RandParamsSettings
+    settings: RandParamsSettings
+    shapes: ClassVar[Mapping[str, tuple[int, ...]]]
+
+    def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
+        random = np.random.RandomState(task_seed)  # the field's generator
+        return [self._draw(random) for _ in range(num_tasks)]
+
+    def _draw(self, random: np.random.RandomState) -> dict[str, Any]:
+        settings, limit = self.settings, self.settings.log_scale_limit
+        multipliers: dict[str, Any] = {}
+        for name, shape in self.shapes.items():
+            base = settings.damping_base if name == "dof_damping" else settings.multiplier_base
+            multipliers[name] = (base ** random.uniform(-limit, limit, shape)).tolist()
+        return multipliers
+
+    def make(
+        self, parameters: Parameters, *, view: View = "stored", reward: Literal["stored", "dense"] = "stored"
+    ) -> "RandParamsTask":
+        simulator = self.simulator()
+        simulator.model.opt.timestep = self.settings.timestep
+        self._scale(simulator, parameters)
+        return RandParamsTask(
+            simulator,
+            horizon=self.settings.horizon,
+            observation_dim=self.observation_dim,
+            action_dim=self.action_dim,
+        )
+
+    def _scale(self, simulator: Any, parameters: Parameters) -> None:
+        for name, shape in self.shapes.items():
+            multipliers = np.asarray(parameters[name], dtype=np.float64)
+            if multipliers.shape != shape:
+                raise TaskError(f"{self.name}: {name} has shape {multipliers.shape}, the model needs {shape}")
+            array = getattr(simulator.model, name)
+            array[:] = array.copy() * multipliers
+        if self.settings.constants == "recomputed":
+            import mujoco
+
+            mujoco.mj_setConst(simulator.model, simulator.data)
+
+    def fingerprint(self) -> dict[str, Any]:
+        simulator = self.simulator()
+        try:
+            simulator.model.opt.timestep = self.settings.timestep
+            return simulation_fingerprint(simulator) | {"constants": self.settings.constants}
+        finally:
+            simulator.close()
+
+    @abc.abstractmethod
+    def simulator(self) -> Any:
+        """Gymnasium's environment with the nominal body."""
+
+
+@final
+class HopperRandParams(_RandParams):
+    """One leg; ends when the torso is not above 0.7 m or leans 0.2 rad or more."""
+
+    observation_dim = 11
+    action_dim = 3
+    shapes: ClassVar = {
+        "body_mass": (5,),
+        "body_inertia": (5, 3),
+        "dof_damping": (6,),
+        "geom_friction": (5, 3),
+    }
+
+    def simulator(self) -> Any:
+        from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
+
+        return HopperEnv()
+
+
+@final
+class WalkerRandParams(_RandParams):
+    """Two legs; ends when the torso leaves heights (0.8, 2) m or leans 1 rad or more."""
+
+    observation_dim = 17
+    action_dim = 6
+    shapes: ClassVar = {
+        "body_mass": (8,),
+        "body_inertia": (8, 3),
+        "dof_damping": (9,),
+        "geom_friction": (8, 3),
+    }
+
+    def simulator(self) -> Any:
+        from gymnasium.envs.mujoco.walker2d_v5 import Walker2dEnv
+
+        return Walker2dEnv()
+
+
+@final
+class RandParamsTask(SimulatedTask):
+    """A robot with one body: reward v + 1 - 0.001 |a|^2, v the torso's forward velocity over the step.
+
+    The bonus is paid at the falling step too, as in the published code; Gymnasium's v5 withholds it.
+    """
+
+    def reward(self, action: FloatArray, simulator_reward: float, info: dict[str, Any]) -> float:
+        return float(info["x_velocity"]) + ALIVE_BONUS - CONTROL_COST * squared_norm(action)
+
+
+ENVIRONMENTS: dict[str, type[Environment]] = {
+    "hopper-rand-params": HopperRandParams,
+    "walker-rand-params": WalkerRandParams,
+}
