@@ -1,0 +1,53 @@
+# make demo   the whole main job on a small environment, from nothing
+# make test   the tests
+# make check  what continuous integration runs
+PYTHON ?= python3
+SEED ?= 0
+JOBS ?= 2
+DATA ?= data/demo
+RUN ?= runs/demo
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+INSTALLED_TEST := $(VENV)/.installed-test
+
+export MUJOCO_GL ?= disabled
+export MPLBACKEND ?= Agg
+
+.PHONY: demo test check format clean
+
+$(BIN)/python:
+	$(PYTHON) -c "import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), 'Python 3.11 to 3.13 needed: make PYTHON=python3.11'"
+	$(PYTHON) -m venv $(VENV)
+
+$(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
+	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
+	$(BIN)/python -m pip install --quiet -c constraints.txt --editable .
+	touch $@
+
+$(INSTALLED_TEST): $(INSTALLED)
+	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[test]'
+	touch $@
+
+demo: $(INSTALLED)
+	$(BIN)/tcmrl-data build point-robot --profile quick --seed $(SEED) --out $(DATA)
+	$(BIN)/tcmrl-data inspect returns $(DATA) --plot $(DATA)-returns.png
+	$(BIN)/tcmrl train $(DATA) --seed $(SEED) --out $(RUN)
+	$(BIN)/tcmrl evaluate $(RUN) --protocol all
+
+test: $(INSTALLED_TEST)
+	$(BIN)/python -m pytest -n $(JOBS)
+
+check: $(INSTALLED_TEST)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -n $(JOBS)
+
+format: $(INSTALLED_TEST)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+clean:
+	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -1,0 +1,1 @@
+"""The commands `tcmrl-data` and `tcmrl`: parse, call one function, print."""

@@ -1,0 +1,198 @@
+"""`tcmrl-data plan` and `build`: from a recipe to a dataset."""
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from .frame import (
+    duration,
+    fail_incomplete,
+    make_table,
+    output_options,
+    print_json,
+    print_table,
+    remark,
+    size,
+)
+from .progress import StageProgress
+
+if TYPE_CHECKING:
+    from tcmrl_data import BuildEvent, Recipe
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+def recipe_options(command: Command) -> Command:
+    """Adds the argument ENV and the options that say what is built and how."""
+    decorators = (
+        click.argument("environment", metavar="ENV"),
+        click.option(
+            "--profile",
+            type=click.Choice(["paper", "quick"]),
+            default="paper",
+            show_default=True,
+            help="The recipe as written, or its smaller form.",
+        ),
+        click.option(
+            "--behavior",
+            metavar="SOURCE",
+            help="Where the policies come from, such as sac or scripted; the recipe's choice if left out.",
+        ),
+        click.option(
+            "--tasks",
+            metavar="LIST",
+            help="Indices of the full task set, such as 0-9,12, instead of the profile's choice.",
+        ),
+        click.option(
+            "--set",
+            "overrides",
+            metavar="SECTION.KEY=VALUE",
+            multiple=True,
+            help="Change a value of the recipe; may be repeated.",
+        ),
+        click.option(
+            "--workers", type=click.IntRange(min=1), help="Processes at a time; all cores if left out."
+        ),
+        click.option(
+            "--engine", default="local", show_default=True, metavar="NAME", help="Where the work runs: local."
+        ),
+        output_options,
+    )
+    for decorator in reversed(decorators):
+        command = decorator(command)
+    return command
+
+
+@click.command()
+@recipe_options
+def plan(
+    environment: str,
+    profile: str,
+    behavior: str | None,
+    tasks: str | None,
+    overrides: tuple[str, ...],
+    workers: int | None,
+    engine: str,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Say what a build of ENV would take.
+
+    The time is estimated from a probe of a few seconds on this machine.
+
+    \b
+    Examples:
+      tcmrl-data plan half-cheetah-vel
+      tcmrl-data plan ml1/reach --behavior scripted --tasks 0-9 --workers 8
+    """
+    import tcmrl_data
+
+    recipe = _load(environment, profile, behavior, overrides)
+    chosen = _parse_tasks(recipe, tasks)
+    tcmrl_data.plugin("tcmrl_data.engine", "engine", engine)
+    remark("measuring this machine for a few seconds …", quiet=quiet or as_json)
+    planned = tcmrl_data.plan_build(recipe, tasks=chosen, workers=workers)
+    if as_json:
+        print_json(dataclasses.asdict(planned))
+        return
+    table = make_table(
+        f"Plan: {planned.environment}, profile {planned.profile}", columns=["", " "], text=["", " "]
+    )
+    rows = {
+        "behavior": planned.behavior,
+        "tasks": f"{planned.tasks:,} ({planned.train:,} train, {planned.test:,} test)",
+        "snapshots per task": f"{planned.snapshots:,}",
+        "parts": f"{planned.parts:,} with {planned.episodes:,} episodes",
+        "environment steps of training": f"{planned.training_steps:,}",
+        "stored environment steps": f"{planned.rollout_steps:,} at most",
+        "size": f"{size(planned.bytes)} at most",
+        "time": f"about {duration(planned.seconds)} with {planned.workers} workers",
+    }
+    for name, value in rows.items():
+        table.add_row(name, value)
+    print_table(table)
+
+
+@click.command()
+@recipe_options
+@click.option(
+    "--out", type=click.Path(path_type=Path), metavar="FOLDER", help="The dataset; data/ENV if left out."
+)
+@click.option(
+    "--seed",
+    type=click.IntRange(min=0),
+    default=0,
+    show_default=True,
+    help="Seeds behavior training and rollouts; tasks and split do not depend on it.",
+)
+def build(
+    environment: str,
+    profile: str,
+    behavior: str | None,
+    tasks: str | None,
+    overrides: tuple[str, ...],
+    workers: int | None,
+    engine: str,
+    as_json: bool,
+    quiet: bool,
+    out: Path | None,
+    seed: int,
+) -> None:
+    """Build a dataset of ENV, or what is missing of one.
+
+    A finished dataset is verified and left alone. A build that was stopped goes on when the same command
+    runs again. `--tasks` with other indices extends a dataset.
+
+    \b
+    Examples:
+      tcmrl-data build point-robot --profile quick
+      tcmrl-data build half-cheetah-vel --tasks 0-9 --workers 4 --out data/cheetah
+      tcmrl-data build ml1/reach --behavior scripted --set rollouts.episodes=20
+    """
+    import tcmrl_data
+
+    recipe = _load(environment, profile, behavior, overrides)
+    chosen = _parse_tasks(recipe, tasks)
+    with StageProgress(quiet=quiet) as progress:
+        report = tcmrl_data.build_dataset(
+            recipe,
+            out or Path("data") / environment,
+            seed=seed,
+            tasks=chosen,
+            workers=workers,
+            engine=engine,
+            progress=lambda event: _show(event, progress),
+        )
+    if as_json:
+        print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
+    else:
+        click.echo(
+            f"{report.dataset}: {report.built:,} parts built, {report.present:,} were there and hold, "
+            f"in {duration(report.seconds)}; root {report.root[:12]}"
+        )
+    if report.failed:
+        more = "" if len(report.failed) == 1 else f" (and {len(report.failed) - 1} more)"
+        fail_incomplete(f"{report.failed[0]}{more}; the same command tries again what is missing")
+
+
+def _load(environment: str, profile: str, behavior: str | None, overrides: tuple[str, ...]) -> "Recipe":
+    import tcmrl_data
+
+    chosen = next(each for each in tcmrl_data.PROFILES if each == profile)
+    return tcmrl_data.load_recipe(environment, profile=chosen, overrides=overrides, behavior=behavior)
+
+
+def _parse_tasks(recipe: "Recipe", text: str | None) -> list[int] | None:
+    import tcmrl_data
+
+    return None if text is None else tcmrl_data.parse_indices(text, recipe.environment["tasks"])
+
+
+def _show(event: "BuildEvent", progress: StageProgress) -> None:
+    if event.kind == "unit_failed":
+        progress.note(event.message)
+    progress.update("behavior training", done=event.steps_done, total=event.steps_total, unit="steps")
+    progress.update("published parts", done=event.parts_done, total=event.parts_total, unit="parts")

@@ -1,0 +1,159 @@
+"""`tcmrl-data`: plan, build, list, inspect and export datasets."""
+
+import sys
+from pathlib import Path
+
+import click
+
+from .building import build, plan
+from .frame import make_table, output_options, print_json, print_table, remark, run, size
+from .inspection import inspect
+from .progress import StageProgress
+
+CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    sys.exit(run(data))
+
+
+@click.group(
+    name="tcmrl-data", context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
+)
+@click.version_option(package_name="tcmrl")
+def data() -> None:
+    """Make, look at and convert datasets for offline meta-reinforcement learning.
+
+    \b
+    Examples:
+      tcmrl-data plan point-robot --profile quick
+      tcmrl-data build point-robot --profile quick
+      tcmrl-data inspect returns data/point-robot --plot returns.png
+
+    Exit codes: 0 done, 1 a check failed or work is incomplete, 2 bad usage or bad input.
+    """
+
+
+for _command in (plan, build, inspect):
+    data.add_command(_command)
+
+
+@data.command()
+@output_options
+def envs(as_json: bool, quiet: bool) -> None:
+    """List the environments that have a recipe.
+
+    \b
+    Example:
+      tcmrl-data envs --json
+    """
+    import tcmrl_data
+
+    rows = tcmrl_data.list_environments()
+    if as_json:
+        print_json({"environments": rows})
+        return
+    heads = {
+        "name": "environment",
+        "observation_dim": "observation",
+        "action_dim": "action",
+        "horizon": "horizon",
+        "tasks": "tasks",
+        "train": "train",
+        "test": "test",
+    }
+    table = make_table("Environments", columns=heads.values(), text=["environment"])
+    for row in rows:
+        table.add_row(*(str(row[key]) for key in heads))
+    print_table(table)
+
+
+@data.command(name="list")
+@click.argument("root", type=click.Path(path_type=Path), required=False)
+@output_options
+def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
+    """List the datasets below ROOT (data if left out).
+
+    \b
+    Example:
+      tcmrl-data list data --json
+    """
+    import tcmrl_data
+
+    if root is not None and not root.is_dir():
+        raise click.ClickException(f"{root} is no folder; name one that holds datasets")
+    root = root or Path("data")
+    rows = tcmrl_data.list_datasets(root)
+    if as_json:
+        print_json({"datasets": rows})
+        return
+    if not rows:
+        remark(f"no datasets below {root}; build one with `tcmrl-data build ENV`", quiet=quiet)
+        return
+    columns = ["dataset", "environment", "profile", "behavior", "seed", "tasks", "parts", "state", "root"]
+    words = ["dataset", "environment", "profile", "behavior", "state", "root"]
+    table = make_table(f"Datasets below {root}", columns=columns, text=words)
+    for row in rows:
+        if "error" in row:
+            table.add_row(row["path"], *[""] * 6, f"unreadable: {row['error']}", "")
+            continue
+        state = "complete" if row["complete"] else "incomplete"
+        values = [row[key] for key in ("path", "name", "profile", "behavior", "seed", "tasks", "parts")]
+        table.add_row(*map(str, values), state, row["root"][:12])
+    print_table(table)
+
+
+@data.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@click.option("--format", "format_name", required=True, metavar="NAME", help="The format: hdf5.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="A new folder; DATASET-FORMAT if left out.",
+)
+@click.option(
+    "--snapshots",
+    default="all",
+    show_default=True,
+    metavar="RULE",
+    help="Which snapshots: all, last, steps>=N, or return>=Q with a quantile Q.",
+)
+@output_options
+def export(
+    dataset: Path, format_name: str, out: Path | None, snapshots: str, as_json: bool, quiet: bool
+) -> None:
+    """Write DATASET in another format.
+
+    DATASET is a folder or its manifest.json; every task becomes one file in a new folder.
+
+    \b
+    Examples:
+      tcmrl-data export data/point-robot --format hdf5
+      tcmrl-data export data/point-robot --format hdf5 --snapshots last --out flat
+    """
+    import tcmrl_data
+
+    exporter = tcmrl_data.plugin("tcmrl_data.interchange", "format", format_name)
+    opened = tcmrl_data.open_dataset(dataset)
+    target = out or opened.folder.resolve().with_name(f"{opened.folder.resolve().name}-{format_name}")
+    with StageProgress(quiet=quiet) as progress:
+        files = exporter.export(
+            opened,
+            target,
+            snapshots=snapshots,
+            progress=lambda done, total: progress.update("export", done=done, total=total, unit="parts"),
+        )
+    total = sum(file.stat().st_size for file in files)
+    if as_json:
+        print_json(
+            {
+                "format": format_name,
+                "out": str(target),
+                "files": [str(file) for file in files],
+                "bytes": total,
+            }
+        )
+    else:
+        click.echo(f"{target}: {len(files):,} files, {size(total)}")

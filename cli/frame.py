@@ -1,0 +1,131 @@
+"""The frame around every command: options they share, one-line errors, exit codes, JSON and tables."""
+
+import json
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from tcmrl_data.errors import TcmrlError
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+DONE, INCOMPLETE, BAD_INPUT = 0, 1, 2
+"""Exit codes: done; a check failed or work is incomplete; bad usage or bad input."""
+
+SPANS = ((86_400, "d", 3_600, "h"), (3_600, "h", 60, "min"), (60, "min", 1, "s"))
+"""Seconds and name of a unit of time, and of the one shown beside it."""
+
+PIPE_WIDTH = 160
+"""Columns of a table that does not go to a terminal."""
+
+
+def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
+    """Runs a command line and returns its exit code; errors become one line on standard error.
+
+    Args:
+        command: the root command.
+        arguments: what follows the program's name; those of this process where None.
+    """
+    try:
+        result = command.main(args=arguments, prog_name=command.name, standalone_mode=False)
+    except click.exceptions.NoArgsIsHelpError as error:
+        error.show()
+        return BAD_INPUT
+    except click.UsageError as error:
+        path = error.ctx.command_path if error.ctx else command.name
+        return _fail(f"{error.format_message()} See `{path} --help`.", BAD_INPUT)
+    except click.ClickException as error:
+        return _fail(error.format_message(), BAD_INPUT)
+    except TcmrlError as error:
+        return _fail(str(error), BAD_INPUT)
+    except click.Abort:
+        return _fail("interrupted; what was finished stays, the same command goes on from there", INCOMPLETE)
+    except OSError as error:
+        return _fail(f"{error.filename or 'a file'}: {error.strerror or error}", BAD_INPUT)
+    return result if isinstance(result, int) else DONE
+
+
+def fail_incomplete(message: str) -> None:
+    """Ends the running command with exit code 1 and one line that says what is not as it must be."""
+    click.get_current_context().exit(_fail(message, INCOMPLETE))
+
+
+def output_options(command: Command) -> Command:
+    """Adds `--json` and `--quiet`."""
+    as_json = click.option(
+        "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else on standard output."
+    )
+    quiet = click.option("--quiet", is_flag=True, help="No progress and no remarks, only results and errors.")
+    return as_json(quiet(command))
+
+
+def print_json(document: Any) -> None:
+    """Prints one JSON document on standard output."""
+    click.echo(json.dumps(document, indent=2, allow_nan=False))
+
+
+def print_table(table: "Table") -> None:
+    """Prints a table on standard output: as wide as the terminal, or as wide as it needs in a pipe."""
+    from rich.console import Console
+
+    Console(width=None if sys.stdout.isatty() else PIPE_WIDTH).print(table)
+
+
+def make_table(title: str, *, columns: Iterable[str], text: Iterable[str] = ()) -> "Table":
+    """An empty table.
+
+    Args:
+        title: stands above it.
+        columns: headings, left to right.
+        text: columns that hold words and align left; all others hold numbers and align right.
+    """
+    from rich import box
+    from rich.table import Table
+
+    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    words = set(text)
+    for column in columns:
+        if column in words:
+            table.add_column(column, overflow="fold")
+        else:
+            table.add_column(column, justify="right", no_wrap=True)
+    return table
+
+
+def remark(message: str, *, quiet: bool) -> None:
+    """Says something that is no result, on standard error."""
+    if not quiet:
+        click.echo(message, err=True)
+
+
+def number(value: float | None) -> str:
+    """Two decimals; a dash where there is no value."""
+    return "–" if value is None else f"{value:,.2f}"
+
+
+def duration(seconds: float) -> str:
+    """A time span in its two largest units, such as `3 min 20 s`."""
+    whole = round(seconds)
+    for long, name, short, short_name in SPANS:
+        if whole >= long:
+            return f"{whole // long} {name} {whole % long // short} {short_name}"
+    return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
+
+
+def size(num_bytes: float) -> str:
+    """Bytes in decimal units, such as `12.3 MB`."""
+    for unit in ("B", "kB", "MB", "GB"):
+        if num_bytes < 1_000:
+            return f"{num_bytes:.0f} B" if unit == "B" else f"{num_bytes:.1f} {unit}"
+        num_bytes /= 1_000
+    return f"{num_bytes:.1f} TB"
+
+
+def _fail(message: str, code: int) -> int:
+    click.echo(f"Error: {' '.join(message.split())}", err=True)
+    return code

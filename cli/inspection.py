@@ -1,0 +1,189 @@
+"""`tcmrl-data inspect`: what a dataset holds."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, TypeVar
+
+import click
+
+from .frame import fail_incomplete, make_table, number, output_options, print_json, print_table, remark
+
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+
+@click.group()
+def inspect() -> None:
+    """Look at a dataset: its returns, tasks, snapshots or episodes.
+
+    DATASET is the dataset's folder or its manifest.json.
+    """
+
+
+def dataset_command(command: Command) -> Command:
+    """Adds the argument DATASET and the options of every inspection."""
+    argument = click.argument("dataset", type=click.Path(path_type=Path))
+    return argument(output_options(command))
+
+
+@inspect.command()
+@dataset_command
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Also draw the learning curves of all tasks, as .png, .svg or .pdf.",
+)
+@click.option(
+    "--recompute", is_flag=True, help="Sum the stored rewards again and compare with the recorded returns."
+)
+def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recompute: bool) -> None:
+    """Undiscounted returns per snapshot step, over training and test tasks apart.
+
+    \b
+    Examples:
+      tcmrl-data inspect returns data/point-robot --plot returns.png
+      tcmrl-data inspect returns data/point-robot --recompute --json
+    """
+    import tcmrl_data
+    from tcmrl_data.returns import first_disagreement, plot_returns, summarize
+
+    opened = tcmrl_data.open_dataset(dataset)
+    table = tcmrl_data.return_table(opened, recompute=recompute)
+    if plot is not None:
+        plot_returns(opened, table, plot)
+        remark(f"learning curves written to {plot}", quiet=quiet)
+    if as_json:
+        print_json(table)
+    else:
+        _print_returns(table["name"], summarize(table))
+    if recompute:
+        difference = first_disagreement(tcmrl_data.return_table(opened), table)
+        if difference is not None:
+            fail_incomplete(f"{opened.folder}: {difference}; delete its folder and build again")
+
+
+def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:
+    with_success = any(row["success_rate"] is not None for row in rows)
+    columns = ["step", "split", "tasks", "episodes", "mean", "std", "min", "max"]
+    table = make_table(
+        f"{name}: mean return of a task, over tasks",
+        columns=columns + ["success"] * with_success,
+        text=["split"],
+    )
+    for previous, row in zip([None, *rows], rows, strict=False):
+        repeated = previous is not None and previous["step"] == row["step"]
+        success = [f"{row['success_rate']:.0%}"] if row["success_rate"] is not None else []
+        table.add_row(
+            "" if repeated else f"{row['step']:,}",
+            row["split"],
+            str(row["tasks"]),
+            f"{row['episodes']:,}",
+            *(number(row[key]) for key in ("mean", "std", "min", "max")),
+            *success,
+        )
+    print_table(table)
+
+
+@inspect.command()
+@dataset_command
+def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
+    """Tasks with split, parameters and reference returns.
+
+    \b
+    Example:
+      tcmrl-data inspect tasks data/point-robot
+    """
+    import tcmrl_data
+    from tcmrl_data.returns import task_table
+
+    document = task_table(tcmrl_data.open_dataset(dataset))
+    if as_json:
+        print_json(document)
+        return
+    references = ["uniform", "oracle", "scripted", "behavior"]
+    table = make_table(
+        f"{document['name']}: tasks",
+        columns=["task", "split", "parameters", *references],
+        text=["split", "parameters"],
+    )
+    for row in document["tasks"]:
+        known = row["references"] or dict.fromkeys(references)
+        values = (number(known[each]) for each in references)
+        table.add_row(str(row["task"]), row["split"], _shortened(row["parameters"]), *values)
+    print_table(table)
+
+
+@inspect.command()
+@dataset_command
+def snapshots(dataset: Path, as_json: bool, quiet: bool) -> None:
+    """Every snapshot with the id of its part.
+
+    \b
+    Example:
+      tcmrl-data inspect snapshots data/point-robot
+    """
+    import tcmrl_data
+    from tcmrl_data.returns import snapshot_table
+
+    document = snapshot_table(tcmrl_data.open_dataset(dataset))
+    if as_json:
+        print_json(document)
+        return
+    columns = ["task", "split", "step", "id", "episodes", "steps", "mean return"]
+    table = make_table(f"{document['name']}: snapshots", columns=columns, text=["split", "id"])
+    for row in document["snapshots"]:
+        counts = (f"{row['episodes']:,}", f"{row['steps']:,}", number(row["mean"]))
+        table.add_row(str(row["task"]), row["split"], f"{row['step']:,}", row["id"][:12], *counts)
+    print_table(table)
+
+
+@inspect.command()
+@dataset_command
+@click.option("--task", type=click.IntRange(min=0), help="Only this task.")
+@click.option("--step", type=click.IntRange(min=0), help="Only snapshots of this step.")
+def episodes(dataset: Path, as_json: bool, quiet: bool, task: int | None, step: int | None) -> None:
+    """Every episode: length, return, how it ended, success.
+
+    \b
+    Example:
+      tcmrl-data inspect episodes data/point-robot --task 7 --step 3000
+    """
+    import tcmrl_data
+    from tcmrl_data.returns import episode_table
+
+    document = episode_table(tcmrl_data.open_dataset(dataset), task=task, step=step)
+    if as_json:
+        print_json(document)
+        return
+    columns = ["task", "step", "episode", "length", "return", "ended", "success"]
+    table = make_table(f"{document['name']}: episodes", columns=columns, text=["ended", "success"])
+    for row in document["episodes"]:
+        success = "–" if row["success"] is None else "yes" if row["success"] else "no"
+        table.add_row(
+            str(row["task"]),
+            f"{row['step']:,}",
+            str(row["episode"]),
+            str(row["length"]),
+            number(row["return"]),
+            "terminated" if row["terminated"] else "truncated" if row["truncated"] else "–",
+            success,
+        )
+    print_table(table)
+
+
+def _shortened(parameters: dict[str, Any]) -> str:
+    """Parameters with floats of three decimals and long lists cut, as one line."""
+
+    def shorten(value: Any) -> Any:
+        if isinstance(value, float):
+            return round(value, 3)
+        if isinstance(value, list):
+            return [shorten(each) for each in value[:6]] + ["…"] * (len(value) > 6)
+        if isinstance(value, dict):
+            return {key: shorten(each) for key, each in value.items()}
+        return value
+
+    return ", ".join(
+        f"{key}={json.dumps(shorten(value), ensure_ascii=False)}" for key, value in parameters.items()
+    )
