@@ -1,0 +1,296 @@
+"""`tcmrl`: meta-train on a dataset's manifest, and meta-test a run."""
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, get_args
+
+import click
+
+from .frame import duration, make_table, number, output_options, print_json, print_table, remark, run
+from .progress import StageProgress
+
+if TYPE_CHECKING:
+    from tcmrl_algo import Evaluation, Progress, TrainingReport
+    from tcmrl_data import Dataset
+
+Profile = Literal["paper", "quick"]
+Protocol = Literal["paper", "offline", "idaq"]
+
+
+def main() -> None:
+    """Entry point of the console script."""
+    sys.exit(run(tcmrl))
+
+
+@click.group(name="tcmrl", context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.version_option(package_name="tcmrl")
+def tcmrl() -> None:
+    """Meta-train on a dataset made by `tcmrl-data build`, and adapt to its test tasks.
+
+    \b
+    Examples:
+      tcmrl-data build point-robot --profile quick
+      tcmrl train data/point-robot
+      tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all
+
+    Exit codes: 0 done, 1 work is incomplete, 2 bad usage or bad input.
+    """
+
+
+@tcmrl.command()
+@click.argument("manifest", metavar="MANIFEST", type=click.Path(path_type=Path))
+@click.option("--algo", metavar="NAME", help="tcmrl, or its control no_context; the recipe's if left out.")
+@click.option(
+    "--profile",
+    type=click.Choice(get_args(Profile)),
+    help="Whose training table to use; the one the dataset was built with if left out.",
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    help="Stop here instead of at run.steps; the learning rate's schedule stays that of run.steps.",
+)
+@click.option("--device", help="A torch device, such as cpu (default) or cuda.")
+@click.option(
+    "--set",
+    "overrides",
+    metavar="SECTION.KEY=VALUE",
+    multiple=True,
+    help="Change a value of the training table; may be repeated.",
+)
+@click.option("--resume", is_flag=True, help="Go on from the newest checkpoint in --out.")
+@click.option("--seed", type=click.IntRange(min=0), help="Seed of everything random; 0 if left out.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    help="The run's folder; runs/<environment>-<algorithm>-seed<seed> if left out.",
+)
+@output_options
+def train(
+    manifest: Path,
+    algo: str | None,
+    profile: Profile | None,
+    steps: int | None,
+    device: str | None,
+    overrides: tuple[str, ...],
+    resume: bool,
+    seed: int | None,
+    out: Path | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Meta-train on the training tasks of a dataset, MANIFEST (its folder or manifest.json).
+
+    The dataset carries the training table of its recipe; --set changes single values of it. A killed
+    run goes on with --resume, and ends as if it had never stopped.
+
+    \b
+    Examples:
+      tcmrl train data/point-robot --seed 1
+      tcmrl train data/point-robot --algo no_context
+      tcmrl train data/half-cheetah-vel --set batch.window_length=8 --set tcmrl.latent=40
+      tcmrl train data/point-robot --seed 1 --resume
+    """
+    from tcmrl_data import open_dataset
+
+    if resume and (profile is not None or overrides):
+        raise click.UsageError("--resume keeps the run's settings; leave out --profile and --set.")
+    dataset = open_dataset(manifest)
+    with StageProgress(quiet=quiet) as progress:
+        if resume:
+            folder = out or _run_folder(dataset, algo or _default_algorithm(dataset), seed or 0)
+            report = _resume(
+                folder, dataset, algo=algo, seed=seed, steps=steps, device=device, progress=progress
+            )
+        else:
+            report = _train(
+                out,
+                dataset,
+                algo=algo,
+                profile=profile or dataset.manifest.profile,
+                overrides=overrides,
+                seed=seed or 0,
+                steps=steps,
+                device=device or "cpu",
+                progress=progress,
+            )
+    _print_training(report, as_json=as_json, quiet=quiet)
+
+
+def _train(
+    out: Path | None,
+    dataset: "Dataset",
+    *,
+    algo: str | None,
+    profile: Profile,
+    overrides: Sequence[str],
+    seed: int,
+    steps: int | None,
+    device: str,
+    progress: StageProgress,
+) -> "TrainingReport":
+    from tcmrl_algo import resolve, train_run
+
+    table = dataset.manifest.training[profile]
+    place = f"training table of {dataset.name!r}, profile {profile!r}"
+    config = resolve(table, place=place, algorithm=algo, overrides=overrides)
+    return train_run(
+        dataset,
+        out or _run_folder(dataset, config.settings.run.algorithm, seed),
+        config=config,
+        profile=profile,
+        seed=seed,
+        steps=steps,
+        device=device,
+        report=lambda event: _show(progress, event),
+    )
+
+
+def _resume(
+    folder: Path,
+    dataset: "Dataset",
+    *,
+    algo: str | None,
+    seed: int | None,
+    steps: int | None,
+    device: str | None,
+    progress: StageProgress,
+) -> "TrainingReport":
+    from tcmrl_algo import open_run, resume_run
+
+    record = open_run(folder).record
+    for name, asked, recorded in (
+        ("--algo", algo, record.config.settings.run.algorithm),
+        ("--seed", seed, record.seed),
+    ):
+        if asked is not None and asked != recorded:
+            raise click.UsageError(
+                f"{folder} is a run with {name} {recorded}, not {asked}; leave {name} out."
+            )
+    return resume_run(
+        folder, dataset, steps=steps, device=device, report=lambda event: _show(progress, event)
+    )
+
+
+def _default_algorithm(dataset: "Dataset") -> str:
+    from tcmrl_algo import resolve
+
+    table = dataset.manifest.training[dataset.manifest.profile]
+    return resolve(table, place=f"training table of {dataset.name!r}").settings.run.algorithm
+
+
+def _run_folder(dataset: "Dataset", algorithm: str, seed: int) -> Path:
+    return Path("runs") / f"{dataset.name}-{algorithm}-seed{seed}"
+
+
+def _show(progress: StageProgress, event: "Progress") -> None:
+    progress.update("training", done=event.step, total=event.steps, unit="steps")
+
+
+def _print_training(report: "TrainingReport", *, as_json: bool, quiet: bool) -> None:
+    record = report.run.record
+    algorithm = record.config.settings.run.algorithm
+    if as_json:
+        print_json(
+            {
+                "run": str(report.run.folder),
+                "algorithm": algorithm,
+                "environment": record.environment,
+                "profile": record.profile,
+                "seed": record.seed,
+                "steps": report.step,
+                "seconds": round(report.seconds, 3),
+                "digest": report.digest,
+            }
+        )
+        return
+    click.echo(
+        f"{report.run.folder}: {algorithm} on {record.environment}, seed {record.seed}, "
+        f"{report.step:,} steps in {duration(report.seconds)}, tensors {report.digest[:12]}"
+    )
+    remark(f"Next: tcmrl evaluate {report.run.folder}", quiet=quiet)
+
+
+@tcmrl.command()
+@click.argument("run_folder", metavar="RUN", type=click.Path(path_type=Path))
+@click.option(
+    "--protocol",
+    type=click.Choice([*get_args(Protocol), "all"]),
+    help="How to adapt; the recipe's choice if left out. `all` runs the three and compares them.",
+)
+@click.option(
+    "--dataset",
+    type=click.Path(path_type=Path),
+    help="The dataset the run was trained on, if it has moved.",
+)
+@click.option(
+    "--episodes", type=click.IntRange(min=1), help="Adaptation episodes per task; the recipe's if left out."
+)
+@output_options
+def evaluate(
+    run_folder: Path,
+    protocol: Protocol | Literal["all"] | None,
+    dataset: Path | None,
+    episodes: int | None,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Adapt the policy in RUN to the test tasks, and score it beside its controls.
+
+    \b
+    paper    uniform actions first, then the policy, its context growing by episode
+    offline  contexts from the test tasks' stored trajectories
+    idaq     contexts of training tasks first; the best-return episode's is kept
+
+    Controls: uniform actions, the oracle, and other tasks' contexts. Returns are undiscounted.
+    With --protocol all, --json prints a list of the three documents.
+
+    \b
+    Examples:
+      tcmrl evaluate runs/point-robot-tcmrl-seed0
+      tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all --json
+    """
+    from tcmrl_algo import evaluate_run
+
+    chosen: Sequence[Protocol | None] = get_args(Protocol) if protocol == "all" else [protocol]
+    results = []
+    with StageProgress(quiet=quiet) as progress:
+        for each in chosen:
+            results.append(evaluate_run(run_folder, protocol=each, dataset_path=dataset, episodes=episodes))
+            progress.update("evaluation", done=len(results), total=len(chosen), unit="protocols")
+    if as_json:
+        documents = [each.to_json() for each in results]
+        print_json(documents if protocol == "all" else documents[0])
+        return
+    _print_table(results)
+    remark("other: the same policy under other tasks' contexts; regret: oracle - adapted", quiet=quiet)
+
+
+def _print_table(results: Sequence["Evaluation"]) -> None:
+    """One row per test task and one of means; under each protocol what adaptation and its control reach."""
+    first = results[0]
+    with_success = any(task.success is not None for each in results for task in each.tasks)
+    columns = ["task", "uniform", "oracle"]
+    for each in results:
+        columns += [f"{each.protocol} {what}" for what in ("adapted", "other", "regret")]
+        columns += [f"{each.protocol} success"] if with_success else []
+    title = f"{first.algorithm} on {first.environment}, seed {first.seed}: returns on the test tasks"
+    table = make_table(title, columns=columns, text=("task",))
+    rows = []
+    for index, task in enumerate(first.tasks):
+        values = [task.random, task.oracle]
+        for each in results:
+            result = each.tasks[index]
+            values += [result.final, result.shuffled, result.regret]
+            values += [result.success] if with_success else []
+        rows.append(values)
+        table.add_row(str(task.task), *(number(value) for value in values))
+    table.add_section()
+    table.add_row("mean", *(number(_mean(column)) for column in zip(*rows, strict=True)))
+    print_table(table)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [each for each in values if each is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None

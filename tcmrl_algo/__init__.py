@@ -1,0 +1,55 @@
+"""tcmrl_algo meta-trains on datasets of tcmrl_data and adapts to unseen tasks.
+
+This is the whole public API; names load on first use, so that `tcmrl --help` needs no torch.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from tcmrl_algo.checkpoint import Run, RunRecord, open_run
+    from tcmrl_algo.config import TrainingConfig, TrainingSettings, resolve
+    from tcmrl_algo.context_algorithm import ContextAlgorithm
+    from tcmrl_algo.evaluate import Evaluation, TaskResult, evaluate_run
+    from tcmrl_algo.problem import Algorithm, Problem
+    from tcmrl_algo.train import Progress, TrainingReport, create_algorithm, resume_run, train_run
+
+_HOMES = {
+    "checkpoint": ("Run", "RunRecord", "open_run"),
+    "config": ("TrainingConfig", "TrainingSettings", "resolve"),
+    "context_algorithm": ("ContextAlgorithm",),
+    "evaluate": ("Evaluation", "TaskResult", "evaluate_run"),
+    "problem": ("Algorithm", "Problem"),
+    "train": ("Progress", "TrainingReport", "create_algorithm", "resume_run", "train_run"),
+}
+_HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
+
+__all__ = [
+    "Algorithm",
+    "ContextAlgorithm",
+    "Evaluation",
+    "Problem",
+    "Progress",
+    "Run",
+    "RunRecord",
+    "TaskResult",
+    "TrainingConfig",
+    "TrainingReport",
+    "TrainingSettings",
+    "create_algorithm",
+    "evaluate_run",
+    "open_run",
+    "resolve",
+    "resume_run",
+    "train_run",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module 'tcmrl_algo' has no attribute {name!r}")
+    return getattr(importlib.import_module(f"tcmrl_algo.{_HOME_OF[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

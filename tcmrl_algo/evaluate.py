@@ -1,0 +1,203 @@
+"""Meta-testing: adapts a trained run to the test tasks and scores it against its controls."""
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from statistics import fmean
+from typing import Any
+
+import numpy as np
+import torch
+
+from tcmrl_algo.checkpoint import Run, open_run
+from tcmrl_algo.config import Protocol, RunSettings
+from tcmrl_algo.protocols import PROTOCOLS, Adaptation, Arena, Context
+from tcmrl_algo.train import create_algorithm
+from tcmrl_data import Dataset, Task, TrainingError, Trajectory, open_dataset
+
+MOST_OTHERS = 3
+"""Other tasks whose contexts are tried on a task; one alone could lie too near or far."""
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """How a run does on one test task; returns are undiscounted sums of rewards.
+
+    Attributes:
+        task: its index.
+        split: `test`.
+        returns: one per adaptation episode.
+        final: mean return of the adapted policy.
+        oracle: return of a controller that knows the task, or None.
+        random: return of uniform actions.
+        regret: oracle - final, or None.
+        normalized: (final - random) / (best - random), best being the oracle or, without one, the best
+            behavior policy.
+        success: share of final episodes that succeed, or None where the environment does not say.
+        shuffled: mean return of the same policy under other tasks' contexts.
+    """
+
+    task: int
+    split: str
+    returns: list[float]
+    final: float
+    oracle: float | None
+    random: float
+    regret: float | None
+    normalized: float | None
+    success: float | None
+    shuffled: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How a run does on all test tasks; means are over them, None where a task has no value."""
+
+    algorithm: str
+    environment: str
+    seed: int
+    protocol: str
+    tasks: list[TaskResult]
+    mean_final: float
+    mean_regret: float | None
+    mean_normalized: float | None
+    mean_shuffled: float
+
+    def to_json(self) -> dict[str, Any]:
+        """The document of `tcmrl evaluate --json`."""
+        return dataclasses.asdict(self)
+
+
+def evaluate_run(
+    run_folder: str | Path,
+    *,
+    protocol: Protocol | None = None,
+    dataset_path: str | Path | None = None,
+    episodes: int | None = None,
+) -> Evaluation:
+    """Evaluates the newest checkpoint of a run.
+
+    Args:
+        run_folder: made by `train`.
+        protocol: instead of the run's own.
+        dataset_path: where the run's dataset lies now, if it has moved.
+        episodes: adaptation episodes per task, instead of the run's own.
+
+    Raises:
+        CheckpointError: no run, no checkpoint, or another dataset than the run was trained on.
+        TrainingError: no test task, or an environment that cannot be evaluated.
+    """
+    run = open_run(run_folder)
+    dataset = open_dataset(dataset_path or run.record.dataset)
+    run.check_dataset(dataset)
+    settings = run.record.config.settings.run
+    changes = {"protocol": protocol, "episodes": episodes}
+    settings = settings.model_copy(update={key: each for key, each in changes.items() if each is not None})
+    torch.set_num_threads(settings.threads)
+    return evaluate_open_run(run, dataset, settings)
+
+
+def evaluate_open_run(run: Run, dataset: Dataset, settings: RunSettings) -> Evaluation:
+    """As `evaluate_run`, for what is already open; `settings` may differ from the run's own."""
+    tasks = dataset.test_tasks
+    if not tasks:
+        raise TrainingError(f"{dataset.folder} holds no test task; build one with `tcmrl-data build --tasks`")
+    algorithm = create_algorithm(run.record, dataset)
+    algorithm.load_tensors(run.newest().tensors())
+    arena = Arena(dataset, algorithm, settings, seed=run.record.seed)
+    try:
+        adaptations = PROTOCOLS[settings.protocol](arena, tasks)
+        results = _results(arena, tasks, adaptations)
+    finally:
+        arena.close()
+    regrets = [each.regret for each in results]
+    scores = [each.normalized for each in results]
+    return Evaluation(
+        algorithm=settings.algorithm,
+        environment=dataset.name,
+        seed=run.record.seed,
+        protocol=settings.protocol,
+        tasks=results,
+        mean_final=fmean(each.final for each in results),
+        mean_regret=_mean(regrets),
+        mean_normalized=_mean(scores),
+        mean_shuffled=fmean(each.shuffled for each in results),
+    )
+
+
+def _results(arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Adaptation]) -> list[TaskResult]:
+    own = {task.index: each.contexts for task, each in zip(tasks, adaptations, strict=True)}
+    others = {task.index: contexts_of_others(arena, task, own) for task in tasks}
+    final = _final_episodes(arena, tasks, own)
+    shuffled = _final_episodes(arena, tasks, others)
+    results = []
+    for task, adaptation in zip(tasks, adaptations, strict=True):
+        references = arena.dataset.references(task.index)
+        mean = _mean_return(final[task.index])
+        best = references.behavior if references.oracle is None else references.oracle
+        results.append(
+            TaskResult(
+                task=task.index,
+                split=task.split,
+                returns=adaptation.returns,
+                final=mean,
+                oracle=references.oracle,
+                random=references.uniform,
+                regret=None if references.oracle is None else references.oracle - mean,
+                normalized=_share(mean, references.uniform, best),
+                success=_success(final[task.index]),
+                shuffled=_mean_return(shuffled[task.index]),
+            )
+        )
+    return results
+
+
+def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) -> list[Context]:
+    """Contexts of up to MOST_OTHERS other tasks, evenly spaced among them.
+
+    Other test tasks lend what they were adapted by; a lone test task borrows stored trajectories of
+    training tasks.
+    """
+    others: list[list[Context]] = [contexts for index, contexts in own.items() if index != task.index]
+    if not others:
+        draws = range(len(own[task.index]))
+        others = [[arena.stored(each, draw=draw) for draw in draws] for each in arena.dataset.train_tasks]
+    chosen = np.linspace(0, len(others) - 1, min(MOST_OTHERS, len(others))).round().astype(int)
+    return [context for index in chosen for context in others[index]]
+
+
+def _final_episodes(
+    arena: Arena, tasks: Sequence[Task], contexts: dict[int, list[Context]]
+) -> dict[int, list[Trajectory]]:
+    """Final episodes of every task, under each of its contexts; by task index."""
+    lanes = [(task, context) for task in tasks for context in contexts[task.index]]
+    found: dict[int, list[Trajectory]] = {task.index: [] for task in tasks}
+    for repeat in range(arena.settings.final_episodes):
+        trajectories = arena.adapted(
+            [task for task, _ in lanes],
+            [context for _, context in lanes],
+            episode=arena.settings.episodes + repeat,  # seeds that no adaptation episode had
+        )
+        for (task, _), trajectory in zip(lanes, trajectories, strict=True):
+            found[task.index].append(trajectory)
+    return found
+
+
+def _mean_return(trajectories: Sequence[Trajectory]) -> float:
+    return fmean(each.undiscounted_return for each in trajectories)
+
+
+def _success(trajectories: Sequence[Trajectory]) -> float | None:
+    if any("success" not in each.extras for each in trajectories):
+        return None
+    return fmean(float(each.extras["success"].any()) for each in trajectories)
+
+
+def _share(value: float, low: float, high: float) -> float | None:
+    return None if high == low else (value - low) / (high - low)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [each for each in values if each is not None]
+    return fmean(known) if len(known) == len(values) else None

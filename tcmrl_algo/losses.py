@@ -1,0 +1,272 @@
+"""Every loss as one pure function: tensors in, a scalar out, one equation of the paper each.
+
+The paper is "TCMRL", whose equation numbers are quoted. `mask` is True on real entries and False on padding;
+padding never changes a value or a gradient. Wherever the paper sums over time, these functions take the mean
+over real entries, so that loss weights mean the same for short and long episodes.
+"""
+
+from typing import Literal
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+Scalar = Float[Tensor, ""]
+NegativeKind = Literal["random", "max", "min"]
+
+
+def masked_mean(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"]) -> Scalar:
+    """Mean of the values where the mask is True; 0 where it is nowhere True."""
+    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
+
+
+def sparsity_loss(scores: Float[Tensor, "lanes steps"], mask: Bool[Tensor, "lanes steps"]) -> Scalar:
+    """Our reading of Eq. 6: mean over transitions of sigmoid(score).
+
+    Deviation: the printed form is constant (see `literal_sparsity_loss`). Scores before the softmax are
+    free to fall for all but the telling transitions.
+    """
+    return masked_mean(torch.sigmoid(scores), mask)
+
+
+def literal_sparsity_loss(weights: Float[Tensor, "lanes steps"], mask: Bool[Tensor, "lanes steps"]) -> Scalar:
+    """Eq. 6 as printed: L_spa = ||(w_1, ..., w_T)||_1, averaged over lanes.
+
+    Weights are non-negative and sum to 1, so the value is 1 and the gradient 0, whatever the scores are.
+    """
+    return torch.where(mask, weights, 0.0).abs().sum(dim=-1).mean()
+
+
+def reverse_context(
+    representations: Float[Tensor, "lanes steps latent"],
+    weights: Float[Tensor, "lanes steps"],
+    mask: Bool[Tensor, "lanes steps"],
+    *,
+    literal: bool = False,
+) -> Float[Tensor, "lanes latent"]:
+    """The context of what attention neglects: c_neg = sum_t (1 - w_t) c_t / (T - 1) (text above Eq. 8).
+
+    Args:
+        representations: c_t.
+        weights: attention weights w_t, which sum to 1 over each lane's real steps.
+        mask: real steps; T is their number, lane by lane.
+        literal: leave the sum undivided, as printed. Its weights sum to T - 1, so its scale grows with T.
+    """
+    reverse = torch.where(mask, 1.0 - weights, 0.0)
+    if not literal:
+        reverse = reverse / (mask.sum(dim=-1, keepdim=True) - 1).clamp(min=1)
+    return torch.einsum("lt,ltd->ld", reverse, representations)
+
+
+def negative_rewards(
+    rewards: Float[Tensor, "*lanes steps"],
+    mask: Bool[Tensor, "*lanes steps"],
+    *,
+    kind: NegativeKind,
+    noise: Float[Tensor, "*lanes steps"],
+) -> Float[Tensor, "*lanes steps"]:
+    """Wrong targets for L_neg: r' + noise, or the trajectory's largest or smallest reward (Appendix G.3).
+
+    Args:
+        rewards: r'_t of execution trajectories.
+        mask: real steps.
+        kind: `random` adds `noise`; `max` and `min` repeat the trajectory's extreme reward.
+        noise: draws of the noise distribution; used by `random` alone.
+    """
+    if kind == "random":
+        return rewards + noise
+    if kind == "max":
+        return torch.where(mask, rewards, -torch.inf).amax(-1, keepdim=True).expand_as(rewards)
+    return torch.where(mask, rewards, torch.inf).amin(-1, keepdim=True).expand_as(rewards)
+
+
+def positive_reward_loss(
+    predicted: Float[Tensor, "*lanes steps"],
+    rewards: Float[Tensor, "*lanes steps"],
+    mask: Bool[Tensor, "*lanes steps"],
+) -> Scalar:
+    """Eq. 7: L_pos = sum_t (r_hat(s'_t, a'_t, c) - r'_t)^2, as a mean over real steps."""
+    return masked_mean((predicted - rewards) ** 2, mask)
+
+
+def negative_reward_loss(
+    predicted: Float[Tensor, "*lanes steps"],
+    negative: Float[Tensor, "*lanes steps"],
+    mask: Bool[Tensor, "*lanes steps"],
+) -> Scalar:
+    """Eq. 8: L_neg = sum_t (r_hat(s'_t, a'_t, c_neg) - r_neg_t)^2, as a mean over real steps.
+
+    `predicted` must come from an estimator whose parameters are held fixed: the paper keeps L_neg from
+    training it (`networks.call_frozen` does that).
+    """
+    return masked_mean((predicted - negative) ** 2, mask)
+
+
+def positive_return_loss(
+    predicted: Float[Tensor, "*lanes"],
+    rewards: Float[Tensor, "*lanes steps"],
+    mask: Bool[Tensor, "*lanes steps"],
+) -> Scalar:
+    """Eq. 17 (sparse rewards): L_pos = (r_hat(s'_1, a'_1, ..., s'_T, a'_T, c) - sum_t r'_t)^2, lane mean."""
+    return ((predicted - torch.where(mask, rewards, 0.0).sum(dim=-1)) ** 2).mean()
+
+
+def negative_return_loss(
+    predicted: Float[Tensor, "*lanes"],
+    negative: Float[Tensor, "*lanes steps"],
+    mask: Bool[Tensor, "*lanes steps"],
+) -> Scalar:
+    """Eq. 18 (sparse rewards): L_neg = (r_hat(..., c_neg) - sum_t r_neg_t)^2, lane mean.
+
+    As for Eq. 8, the estimator behind `predicted` must be held fixed.
+    """
+    return ((predicted - torch.where(mask, negative, 0.0).sum(dim=-1)) ** 2).mean()
+
+
+def info_nce(
+    queries: Float[Tensor, "*positions tasks latent"],
+    keys: Float[Tensor, "*positions tasks latent"],
+    mask: Bool[Tensor, "*positions tasks"],
+    *,
+    temperature: float = 1.0,
+) -> Scalar:
+    """Eq. 10: -log(exp(q_i . k_i / tau) / sum_l exp(q_i . k_l / tau)), mean over queries that have a rival.
+
+    All tasks' queries at one position meet all tasks' keys there in one matrix product, whose diagonal
+    holds the matching pairs (the trace of Eq. 12).
+
+    Args:
+        queries: z^q of every task at every position.
+        keys: z^k of every task at every position; the one of the same task matches.
+        mask: which tasks exist at a position. The others are in no denominator there.
+        temperature: tau.
+    """
+    logits = torch.einsum("...id,...ld->...il", queries, keys) / temperature
+    logits = torch.where(mask.unsqueeze(-2), logits, -torch.inf)
+    present = mask & (mask.sum(dim=-1, keepdim=True) > 1)  # a lone task has nothing to be told apart from
+    logits = torch.where(present.unsqueeze(-1), logits, 0.0)  # keeps rows without any key free of NaN
+    matching = torch.diagonal(torch.log_softmax(logits, dim=-1), dim1=-2, dim2=-1)
+    return -masked_mean(matching, present)
+
+
+def task_contrastive_loss(
+    representations: Float[Tensor, "tasks trajectories steps latent"],
+    mask: Bool[Tensor, "tasks trajectories steps"],
+    similarity: Float[Tensor, "latent latent"],
+    *,
+    window_length: int,
+    temperature: float = 1.0,
+) -> Scalar:
+    """Eq. 11-12: L_TCL = -1/(T-K+1) 1/B sum_t sum_i log softmax_l(m_i^t W c_l^{t+K-1})[i].
+
+    m^t is the mean of the K - 1 representations before the window's last one. Deviations: the printed
+    log(a / sum a) is undefined for negative a, so Eq. 10's exponentials stand in; and a query keeps its own
+    m_i in the denominator, as in Eq. 10, where Eq. 11 prints m_l. Of tasks that end early, position t knows
+    only those with a whole window there.
+
+    Args:
+        representations: c_t of the n-th trajectory of every task; windows at equal (n, t) are compared.
+        mask: real steps, padding at the end.
+        similarity: W.
+        window_length: K > 1. Trajectories shorter than K have no window.
+        temperature: divides the logits (not in the paper's Eq. 11; 1 there).
+    """
+    if representations.shape[2] < window_length:
+        return (representations * 0.0).sum() + (similarity * 0.0).sum()
+    last = window_length - 1
+    windows = representations.unfold(2, window_length, 1)  # tasks trajectories positions latent K
+    priors = windows[..., :last].mean(dim=-1)
+    return info_nce(
+        (priors @ similarity).permute(1, 2, 0, 3),
+        windows[..., last].permute(1, 2, 0, 3),
+        mask[:, :, last:].permute(1, 2, 0),  # padding is at the end: the last step being real suffices
+        temperature=temperature,
+    )
+
+
+def distance_metric_loss(
+    contexts: Float[Tensor, "contexts latent"],
+    tasks: Int[Tensor, " contexts"],
+    *,
+    epsilon: float = 0.1,
+) -> Scalar:
+    """FOCAL's distance-metric loss (Li et al., 2021), inverse square: gathers each task's contexts.
+
+    L = mean over pairs of one task of d^2 + mean over pairs of two tasks of 1 / (d^2 + epsilon), with
+    d^2 = |c_i - c_j|^2 / latent. Not in the paper; in its published code.
+
+    Args:
+        contexts: several contexts of every task.
+        tasks: the task each of them belongs to.
+        epsilon: bounds the repulsion (published code: 0.1).
+    """
+    squares = (contexts.unsqueeze(0) - contexts.unsqueeze(1)).square().mean(dim=-1)
+    same = tasks.unsqueeze(0) == tasks.unsqueeze(1)
+    pairs = ~torch.eye(len(tasks), dtype=torch.bool, device=tasks.device)
+    return masked_mean(squares, same & pairs) + masked_mean(1.0 / (squares + epsilon), ~same)
+
+
+def orthogonality_loss(weights: Float[Tensor, "lanes steps"]) -> Scalar:
+    """Mean over pairs of tasks i != j of w_i . w_j: how far tasks attend to the same steps.
+
+    Not in the paper; in its published code. Padding has weight 0.
+    """
+    overlap = weights @ weights.T
+    return (overlap.sum() - overlap.diagonal().sum()) / max(len(weights) * (len(weights) - 1), 1)
+
+
+def q_loss(
+    q_values: Float[Tensor, "members rows"],
+    rewards: Float[Tensor, " rows"],
+    terminated: Float[Tensor, " rows"],
+    next_values: Float[Tensor, " rows"],
+    *,
+    gamma: float,
+) -> Scalar:
+    """Temporal-difference error: sum over critics of mean (Q(s, a, c) - (r + gamma (1 - d) V(s', c)))^2.
+
+    Args:
+        q_values: Q of each critic for the stored actions.
+        rewards: scaled rewards.
+        terminated: d, 1 where the task ended the episode; a time limit is 0.
+        next_values: V(s', c) of the target network; no gradient reaches it.
+        gamma: discount factor.
+    """
+    targets = (rewards + gamma * (1.0 - terminated) * next_values).detach()
+    return (q_values - targets).square().mean(dim=-1).sum()
+
+
+def value_loss(values: Float[Tensor, " rows"], targets: Float[Tensor, " rows"]) -> Scalar:
+    """Mean (V(s, c) - [min_k Q_k(s, a~pi, c) - alpha log pi(a|s, c)])^2; no gradient reaches the targets."""
+    return functional.mse_loss(values, targets.detach())
+
+
+def policy_loss(
+    log_probabilities: Float[Tensor, " rows"],
+    q_values: Float[Tensor, " rows"],
+    *,
+    entropy: float,
+) -> Scalar:
+    """Mean of alpha log pi(a|s, c) - min_k Q_k(s, a, c) over a ~ pi, reparameterised."""
+    return (entropy * log_probabilities - q_values).mean()
+
+
+def dual_divergence(behavior: Float[Tensor, " rows"], policy: Float[Tensor, " rows"]) -> Scalar:
+    """BRAC's dual estimate of KL(pi || behavior): mean(log softplus(c_p)) - mean(softplus(c_b)) + 1.
+
+    Args:
+        behavior: dual critic at stored actions, c_b.
+        policy: dual critic at the policy's actions, c_p. softplus(c) estimates pi / behavior.
+    """
+    ratio = functional.softplus(policy).clamp(min=1e-12)  # log of an underflowed ratio would be -inf
+    return torch.log(ratio).mean() - functional.softplus(behavior).mean() + 1.0
+
+
+def gradient_penalty(gradients: Float[Tensor, "rows inputs"]) -> Scalar:
+    """Mean of max(|grad c| - 1, 0)^2 over points between behavior and policy actions.
+
+    Deviation: the published code penalises the critic's output; this is the gradient's norm.
+    """
+    norms = (gradients.square().sum(dim=-1) + 1e-12).sqrt()
+    return functional.relu(norms - 1.0).square().mean()

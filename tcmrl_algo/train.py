@@ -1,0 +1,236 @@
+"""Meta-training: a dataset and a resolved configuration in, a run's folder out."""
+
+import hashlib
+import importlib.metadata
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from tcmrl_algo.checkpoint import Run, RunRecord, open_run, write_run
+from tcmrl_algo.config import ALGORITHMS, TrainingConfig, validated
+from tcmrl_algo.metrics import MetricsWriter
+from tcmrl_algo.problem import Algorithm, MomentsRecord, problem_of
+from tcmrl_data import BatchSizes, CheckpointError, Dataset, Sampler, TrainingError, plugin
+
+PACKAGES = ("torch", "numpy")
+"""Whose versions results depend on."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training run stands.
+
+    Attributes:
+        step: steps done.
+        steps: steps to do.
+        rate: steps per second since the last report.
+        metrics: of that step.
+    """
+
+    step: int
+    steps: int
+    rate: float
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class TrainingReport:
+    """What a finished training run leaves.
+
+    Attributes:
+        run: its folder and record.
+        step: steps done.
+        seconds: wall-clock time of this call.
+        digest: sha256 over all tensors, by which two runs compare.
+    """
+
+    run: Run
+    step: int
+    seconds: float
+    digest: str
+
+
+def ignore(progress: Progress) -> None:
+    """Reports nothing."""
+
+
+def train_run(
+    dataset: Dataset,
+    out: str | Path,
+    *,
+    config: TrainingConfig,
+    profile: str,
+    seed: int = 0,
+    steps: int | None = None,
+    device: str = "cpu",
+    report: Callable[[Progress], None] = ignore,
+) -> TrainingReport:
+    """Trains a new run.
+
+    Args:
+        dataset: what to learn from; its training tasks alone are used.
+        out: the run's folder, made here.
+        config: the resolved training table.
+        profile: whose table it was; recorded.
+        seed: of everything random.
+        steps: where to stop, instead of `run.steps`; schedules keep the length that `run.steps` gives them.
+        device: a torch device.
+        report: called after every logged step.
+
+    Raises:
+        CheckpointError: the folder holds a run already.
+        SelectionError: fewer than two training tasks, or too few snapshots or trajectories.
+        TrainingError: an unusable device, or a loss that is not finite.
+    """
+    if (Path(out) / "run.json").exists():
+        raise CheckpointError(f"{out} holds a run already; go on with --resume, or name another --out")
+    batches = _batches(dataset, config, seed=seed, device=device)
+    record = RunRecord(
+        environment=dataset.name,
+        dataset=str(dataset.folder.resolve()),
+        root=dataset.manifest.root,
+        profile=profile,
+        seed=seed,
+        steps=config.settings.run.steps if steps is None else steps,
+        device=device,
+        config=config,
+        moments=MomentsRecord.of(batches.moments()),
+        versions={name: importlib.metadata.version(name) for name in PACKAGES},
+    )
+    algorithm = create_algorithm(record, dataset)
+    run = write_run(Path(out), record)  # only now: what cannot start leaves nothing behind
+    return _train(run, algorithm, batches, start=0, report=report)
+
+
+def resume_run(
+    out: str | Path,
+    dataset: Dataset,
+    *,
+    steps: int | None = None,
+    device: str | None = None,
+    report: Callable[[Progress], None] = ignore,
+) -> TrainingReport:
+    """Goes on from a run's newest checkpoint; ends as an uninterrupted run of the same length would have.
+
+    Args:
+        out: the run's folder.
+        dataset: the one it was trained on.
+        steps: another place to stop.
+        device: another device.
+        report: called after every logged step.
+
+    Raises:
+        CheckpointError: no run, another dataset, or already further than `steps`.
+        TrainingError: an unusable device, or a loss that is not finite.
+    """
+    run = open_run(out)
+    run.check_dataset(dataset)
+    changes = {"steps": steps, "device": device, "dataset": str(dataset.folder.resolve())}
+    record = run.record.model_copy(update={key: each for key, each in changes.items() if each is not None})
+    start = run.checkpoints()[-1].step if run.checkpoints() else 0
+    if start > record.steps:
+        raise CheckpointError(f"{out} is at step {start} already, beyond --steps {record.steps}")
+    batches = _batches(dataset, record.config, seed=record.seed, device=record.device)
+    algorithm = create_algorithm(record, dataset)
+    if start:
+        algorithm.load_tensors(run.newest().tensors())
+    return _train(write_run(run.folder, record), algorithm, batches, start=start, report=report)
+
+
+def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
+    """A run's algorithm with its networks at their start, for training or for a checkpoint's tensors.
+
+    Raises:
+        TrainingError: an unusable device.
+    """
+    settings = record.config.settings
+    torch.set_num_threads(settings.run.threads)
+    problem = problem_of(
+        dataset.environment,
+        record.moments,
+        seed=record.seed,
+        steps=settings.run.steps,
+        device=_device(record.device),
+    )
+    module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
+    config = validated(module.Config, record.config.method, f"[{settings.run.algorithm}]")
+    algorithm: Algorithm = module.create(problem, settings, config)
+    return algorithm
+
+
+def digest(tensors: Mapping[str, Tensor]) -> str:
+    """sha256 over names, types and bytes of tensors, sorted by name."""
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].cpu().contiguous()
+        total.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        total.update(tensor.numpy().tobytes())
+    return total.hexdigest()
+
+
+def _batches(dataset: Dataset, config: TrainingConfig, *, seed: int, device: str) -> Sampler:
+    """The stream of batches from the training tasks."""
+    settings = config.settings
+    module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
+    selection = dataset.select(split="train", snapshots=settings.run.snapshots)
+    sizes: BatchSizes = module.batch_sizes(settings)
+    return selection.sampler(sizes, seed=seed, device=str(_device(device)))
+
+
+def _train(
+    run: Run,
+    algorithm: Algorithm,
+    batches: Sampler,
+    *,
+    start: int,
+    report: Callable[[Progress], None],
+) -> TrainingReport:
+    """The loop: batch n - 1 makes step n."""
+    settings, last = run.record.config.settings.run, run.record.steps
+    began = time.perf_counter()
+    logged_at, logged_step = began, start
+    with MetricsWriter(run.folder, step=start) as writer:
+        for step in range(start + 1, last + 1):
+            metrics = algorithm.update(batches.batch(step - 1), step)
+            _check_finite(metrics, step)
+            if step % settings.log_every == 0 or step == last:
+                values = {name: float(each) for name, each in metrics.items()}
+                now = time.perf_counter()
+                rate = (step - logged_step) / max(now - logged_at, 1e-9)
+                logged_at, logged_step = now, step
+                writer.write(step, values | {"time/steps_per_second": rate})
+                report(Progress(step, last, rate, values))
+            if step % settings.checkpoint_every == 0 or step == last:
+                _check_finite(algorithm.tensors(), step)
+                run.save(step, algorithm.tensors())
+    return TrainingReport(run, last, time.perf_counter() - began, digest(algorithm.tensors()))
+
+
+def _check_finite(values: Mapping[str, Tensor], step: int) -> None:
+    """Stops training where a quantity is NaN or infinite, one synchronisation for all of them.
+
+    Raises:
+        TrainingError: with the first such quantity and the step.
+    """
+    bad = [torch.isfinite(each).all() for each in values.values()]
+    if bool(torch.stack(bad).all()):
+        return
+    name = next(name for name, finite in zip(values, bad, strict=True) if not finite)
+    raise TrainingError(
+        f"{name} is not finite at step {step}; the last checkpoint is intact: lower optimizer.learning_rate, "
+        "or bound optimizer.gradient_norm, with --set"
+    )
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise TrainingError(f"--device {name!r} cannot be used here: {reason}") from None
+    return device
