@@ -119,7 +119,12 @@ class _Driver:
     """The one writer of a dataset's manifest."""
 
     def __init__(
-        self, recipe: Recipe, out: Path, seed: int, tasks: Sequence[Task], progress: Callable[[BuildEvent], None]
+        self,
+        recipe: Recipe,
+        out: Path,
+        seed: int,
+        tasks: Sequence[Task],
+        progress: Callable[[BuildEvent], None],
     ) -> None:
         self._recipe, self._out, self._seed, self._progress = recipe, out, seed, progress
         self._source = behavior_source(recipe)
@@ -209,7 +214,9 @@ class _Driver:
         best = max(record.statistics.mean for record in records)
         return TaskReferences(**records[0].references.model_dump(), behavior=best)
 
-    def _tell(self, kind: Literal["start", "steps", "part", "unit_done", "unit_failed"], message: str) -> None:
+    def _tell(
+        self, kind: Literal["start", "steps", "part", "unit_done", "unit_failed"], message: str
+    ) -> None:
         self._progress(
             BuildEvent(
                 kind=kind,
@@ -253,7 +260,9 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
         return
     manifest = read_manifest(out)
     if manifest.data_version != DATA_VERSION:
-        raise BuildError(f"{out} has data version {manifest.data_version}, this code makes {DATA_VERSION}; use another --out")
+        raise BuildError(
+            f"{out} has data version {manifest.data_version}, not {DATA_VERSION}; use another --out"
+        )
     if manifest.seed != seed:
         raise BuildError(f"{out} was built with seed {manifest.seed}, not {seed}; use another --out")
     other = _first_difference(manifest.recipe.unit_settings(), recipe.unit_settings())

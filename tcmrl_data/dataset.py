@@ -56,11 +56,14 @@ def _check_files(folder: Path, record: PartRecord) -> None:
     check_layout(folder, {name: each.model_dump() for name, each in record.identity.arrays.items()})
     for name, expected in record.files.items():
         file = folder / name
-        if not file.is_file() or any(each.is_symlink() for each in (file, *file.parents[: name.count("/") + 1])):
+        if not file.is_file() or any(
+            each.is_symlink() for each in (file, *file.parents[: name.count("/") + 1])
+        ):
             raise StoreError(f"{file} is missing or no plain file; delete {folder} and build again")
         if file.stat().st_size != expected.size:
             raise StoreError(
-                f"{file} has {file.stat().st_size} bytes instead of {expected.size}; delete {folder} and build again"
+                f"{file} has {file.stat().st_size} bytes instead of {expected.size}; "
+                f"delete {folder} and build again"
             )
 
 
@@ -122,7 +125,9 @@ class Dataset:
         """
         found = self.manifest.references.get(str(task))
         if found is None:
-            raise ManifestError(f"{self.folder}: task {task} is incomplete; finish it with `tcmrl-data build`")
+            raise ManifestError(
+                f"{self.folder}: task {task} is incomplete; finish it with `tcmrl-data build`"
+            )
         return found
 
     def folder_of(self, task: int, step: int) -> Path:
@@ -149,7 +154,7 @@ class Dataset:
             self._records[task, step] = record
         return self._records[task, step]
 
-    def arrays(self, task: int, step: int) -> dict[str, npt.NDArray[np.generic]]:
+    def arrays(self, task: int, step: int) -> dict[str, npt.NDArray[Any]]:
         """All arrays of a part: flat steps, observations with one row more per episode, offsets."""
         return read_arrays(self.folder_of(task, step), self.part(task, step).identity.arrays)
 
@@ -180,17 +185,25 @@ class Dataset:
         chosen = [self.task(index) for index in tasks] if tasks is not None else list(self.tasks)
         chosen = [task for task in chosen if split is None or task.split == split]
         if not chosen:
-            raise SelectionError(f"{self.folder}: no {split or 'such'} tasks in the dataset; build some with --tasks")
-        return Selection(self, tuple(chosen), {task.index: self._steps(task.index, snapshots) for task in chosen})
+            raise SelectionError(
+                f"{self.folder}: no {split or 'such'} tasks in the dataset; build some with --tasks"
+            )
+        return Selection(
+            self, tuple(chosen), {task.index: self._steps(task.index, snapshots) for task in chosen}
+        )
 
     def _steps(self, task: int, rule: str) -> tuple[int, ...]:
         steps = self.snapshots(task)
         missing = sorted(set(self.manifest.steps) - set(steps))
         if missing:
-            raise SelectionError(f"{self.folder}: task {task} lacks snapshots {missing}; finish it with `tcmrl-data build`")
+            raise SelectionError(
+                f"{self.folder}: task {task} lacks snapshots {missing}; finish it with `tcmrl-data build`"
+            )
         match = re.fullmatch(r"all|last|steps>=(\d+)|return>=(0(?:\.\d+)?|1(?:\.0+)?)", rule.replace(" ", ""))
         if match is None:
-            raise SelectionError(f"snapshots {rule!r}: expected all, last, steps>=N or return>=Q with Q in [0, 1]")
+            raise SelectionError(
+                f"snapshots {rule!r}: expected all, last, steps>=N or return>=Q with Q in [0, 1]"
+            )
         if rule == "last":
             steps = steps[-1:]
         elif match[1]:
@@ -200,7 +213,10 @@ class Dataset:
             threshold = np.quantile(list(means.values()), float(match[2]))
             steps = [step for step in steps if means[step] >= threshold]
         if not steps:
-            raise SelectionError(f"{self.folder}: snapshots {rule!r} leaves nothing of task {task}, which has {list(self.manifest.steps)}")
+            raise SelectionError(
+                f"{self.folder}: snapshots {rule!r} leaves nothing of task {task}, "
+                f"which has {list(self.manifest.steps)}"
+            )
         return tuple(steps)
 
 
@@ -234,7 +250,9 @@ class Selection:
         if test:
             raise SelectionError(f"test tasks {test} must not be trained on; select split='train'")
         if len(self.tasks) < 2:
-            raise SelectionError(f"meta-training needs at least 2 training tasks, the selection has {len(self.tasks)}")
+            raise SelectionError(
+                f"meta-training needs at least 2 training tasks, the selection has {len(self.tasks)}"
+            )
         return Sampler(self, sizes, seed=seed, device=device)
 
 

@@ -18,7 +18,10 @@ Parameters = Mapping[str, Any]
 """JSON values that define one task."""
 
 View = Literal["stored", "full"]
-"""`stored`: what the dataset holds and the meta-learner sees. `full`: with what the task hides, if anything."""
+"""`stored`: what the dataset holds and the meta-learner sees. `full`: with what the task hides too."""
+
+Reward = Literal["stored", "dense"]
+"""`stored`: what the dataset holds. `dense`: shaped, where the stored reward is sparse."""
 
 
 class EnvironmentSettings(BaseModel):
@@ -107,6 +110,7 @@ class Lanes(abc.ABC):
     def step(self, actions: FloatArray, active: BoolArray) -> LaneStep:
         """Steps the active lanes with actions (lanes, action_dim) in [-1, 1]."""
 
+    @abc.abstractmethod
     def close(self) -> None:
         """Frees what the lanes hold."""
 
@@ -134,7 +138,7 @@ class Environment(abc.ABC):
 
     @abc.abstractmethod
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Literal["stored", "dense"] = "stored"
+        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> gymnasium.Env[Any, Any]:
         """One task as a Gymnasium environment: actions in [-1, 1], truncated at the horizon.
 

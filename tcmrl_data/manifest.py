@@ -209,7 +209,9 @@ def read_manifest(path: Path) -> Manifest:
     """
     file = path if path.name == MANIFEST else path / MANIFEST
     if not file.is_file() or file.is_symlink():
-        raise ManifestError(f"{file} does not exist; build a dataset with `tcmrl-data build ENV --out {file.parent}`")
+        raise ManifestError(
+            f"{file} does not exist; build a dataset with `tcmrl-data build ENV --out {file.parent}`"
+        )
     data = file.read_bytes()
     try:
         values = parse_json(data)
@@ -233,10 +235,14 @@ def read_part_record(file: Path) -> PartRecord:
     try:
         values = parse_json(file.read_bytes())
     except (OSError, ValueError) as error:
-        raise ManifestError(f"{file}: not a part record ({error}); delete its folder and build again") from None
+        raise ManifestError(
+            f"{file}: not a part record ({error}); delete its folder and build again"
+        ) from None
     record = _validated(PartRecord, values, file)
     if record.id != digest(values["identity"]):
-        raise ManifestError(f"{file}: id is not the digest of its identity; delete its folder and build again")
+        raise ManifestError(
+            f"{file}: id is not the digest of its identity; delete its folder and build again"
+        )
     for name in record.files:
         if not re.fullmatch(r"[a-z0-9_]{1,64}(\.[a-z]{1,16})?(/c(/\d{1,9}){1,2}|/zarr\.json)?", name):
             raise ManifestError(f"{file}: files names {name[:80]!r}, which no part has")
@@ -246,7 +252,9 @@ def read_part_record(file: Path) -> PartRecord:
 def _validated(kind: type[Record], values: Any, file: Path) -> Record:
     version = values.get("schema_version") if isinstance(values, dict) else None
     if version != SCHEMA_VERSION:
-        raise ManifestError(f"{file}: schema_version {version!r} is not {SCHEMA_VERSION}, which this version reads")
+        raise ManifestError(
+            f"{file}: schema_version {version!r} is not {SCHEMA_VERSION}, which this version reads"
+        )
     try:
         return kind.model_validate_json(canonical_json(values))
     except ValidationError as error:

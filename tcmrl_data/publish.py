@@ -1,4 +1,4 @@
-"""Every file operation that matters: staging, fsync, rename, lock, gc. At-least-once work, exactly-once data."""
+"""Every file operation that matters: staging, fsync, rename, lock, gc."""
 
 import contextlib
 import fcntl

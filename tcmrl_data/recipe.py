@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from importlib.resources.abc import Traversable
 from typing import Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from tcmrl_data.discovery import plugin
 from tcmrl_data.environment import Environment, environment_type, environment_types, make_environment
@@ -43,6 +43,12 @@ class Rollouts(_Table):
 
     episodes: int = Field(ge=1)
     lanes: int = Field(ge=1)
+
+    @model_validator(mode="after")
+    def _full_lane_batches(self) -> "Rollouts":
+        if self.episodes % self.lanes:
+            raise ValueError(f"episodes ({self.episodes}) must be a multiple of lanes ({self.lanes})")
+        return self
 
 
 class TaskChoice(_Table):
@@ -137,12 +143,12 @@ def load_recipe(
         raise RecipeError(f"{place}: unknown table {unknown[0]!r}; known are {', '.join(sorted(TABLES))}")
     if behavior is not None:
         tables["behavior"]["source"] = behavior
-    chosen = _validated(
-        _Behavior, _without_tables(tables["behavior"]), f"{place}, [behavior]"
-    )
+    chosen = _validated(_Behavior, _without_tables(tables["behavior"]), f"{place}, [behavior]")
     settings_type = plugin("tcmrl_data.behavior", "behavior source", chosen.source).Settings
     if chosen.source not in tables["behavior"]:
-        raise RecipeError(f"{place}: behavior source {chosen.source!r} has no [behavior.{chosen.source}] table")
+        raise RecipeError(
+            f"{place}: behavior source {chosen.source!r} has no [behavior.{chosen.source}] table"
+        )
     settings = _validated(
         settings_type, tables["behavior"][chosen.source], f"{place}, [behavior.{chosen.source}]"
     )
@@ -196,7 +202,9 @@ def first_problem(error: ValidationError) -> str:
 
 def _validated(kind: type[Table], values: Mapping[str, Any], place: str) -> Table:
     try:
-        return kind.model_validate_json(json.dumps(values, default=str))  # JSON mode: strict, but lists may be tuples
+        return kind.model_validate_json(
+            json.dumps(values, default=str)
+        )  # JSON mode: strict, but lists may be tuples
     except ValidationError as error:
         raise RecipeError(f"{place}: {first_problem(error)}") from None
 

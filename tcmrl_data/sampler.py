@@ -159,7 +159,9 @@ class Sampler:
             if count < needed:
                 raise SelectionError(f"{place} has {count} selected trajectories, a batch takes {needed}")
             if self.sizes.windows and not windows:
-                raise SelectionError(f"{place} has no trajectory of {self.sizes.window_length} steps for a window")
+                raise SelectionError(
+                    f"{place} has no trajectory of {self.sizes.window_length} steps for a window"
+                )
 
     def batch(self, n: int) -> Batch:
         """The n-th batch, n >= 0; the same for the same selection, sizes and seed."""
@@ -169,9 +171,7 @@ class Sampler:
         num_context = int(random.choice(sizes.context_trajectories))
         transitions = self._draw(random, self._transitions, self._transition_ranges[tasks], sizes.transitions)
         windows = self._draw(random, self._windows, self._window_ranges[tasks], sizes.windows)
-        episodes = distinct(
-            random, self._episode_ranges[tasks], num_context + sizes.execution_trajectories
-        )
+        episodes = distinct(random, self._episode_ranges[tasks], num_context + sizes.execution_trajectories)
         return Batch(
             task_indices=torch.from_numpy(self.task_indices[tasks]),
             transitions=self._gather(transitions, np.ones_like(transitions, dtype=bool)),
@@ -184,15 +184,15 @@ class Sampler:
         """Statistics over all selected transitions."""
         steps = self._gather(self._transitions, np.ones(len(self._transitions), dtype=bool))
 
-        def moments(values: Tensor) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+        def mean_and_std(values: Tensor) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
             array = values.cpu().numpy().astype(np.float64)
             return array.mean(axis=0), np.maximum(array.std(axis=0), 1e-6)
 
-        reward_mean, reward_std = moments(steps.rewards)
+        reward_mean, reward_std = mean_and_std(steps.rewards)
         return Moments(
-            *moments(steps.observations),
-            *moments(steps.next_observations - steps.observations),
-            *moments(steps.actions),
+            *mean_and_std(steps.observations),
+            *mean_and_std(steps.next_observations - steps.observations),
+            *mean_and_std(steps.actions),
             float(reward_mean),
             float(reward_std),
             float(steps.rewards.min()),
@@ -203,9 +203,9 @@ class Sampler:
     @staticmethod
     def _draw(random: np.random.Generator, rows: Indices, ranges: Indices, count: int) -> Indices:
         """(tasks, count) rows, uniform over each task's range."""
-        return rows[random.integers(ranges[:, :1], ranges[:, 1:], (len(ranges), count))] if count else np.zeros(
-            (len(ranges), 0), dtype=np.int64
-        )
+        if not count:
+            return np.zeros((len(ranges), 0), dtype=np.int64)
+        return rows[random.integers(ranges[:, :1], ranges[:, 1:], (len(ranges), count))]
 
     def _trajectories(self, episodes: Indices) -> Steps:
         """Whole episodes, (tasks, count) → (tasks, count, longest episode), padded with the last step."""
@@ -220,7 +220,7 @@ class Sampler:
     def _gather(self, rows: Indices, mask: npt.NDArray[np.bool_]) -> Steps:
         observation_dim, action_dim = self.observation_dim, self.action_dim
         index = torch.from_numpy(rows.reshape(-1)).to(self.device)
-        values = torch.index_select(self._rows, 0, index).view(*rows.shape, -1)
+        values = torch.index_select(self._rows, 0, index).view(*rows.shape, self._rows.shape[1])
         following = torch.index_select(self._rows[:, :observation_dim], 0, index + 1)
         return Steps(
             observations=values[..., :observation_dim],
@@ -250,7 +250,7 @@ def _ranges(counts: list[int]) -> Indices:
 
 
 def _table(trajectories: list[Trajectory], observation_dim: int, action_dim: int) -> npt.NDArray[np.float32]:
-    """Rows (observation, action, reward, terminated); the last row of an episode is zero after its observation."""
+    """Rows (observation, action, reward, terminated); an episode's last row holds an observation alone."""
     rows = sum(len(each) + 1 for each in trajectories)
     table = np.zeros((rows, observation_dim + action_dim + 2), dtype=np.float32)
     start = 0

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, final
 
@@ -39,8 +40,8 @@ class GaussianPolicy(_Description):
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Name and shape of every tensor."""
         widths = (self.observation_dim, *self.hidden)
-        layers = {f"hidden.{i}": (out, into) for i, (into, out) in enumerate(zip(widths, widths[1:], strict=False))}
-        layers |= {name: (self.action_dim, widths[-1]) for name in ("mean", "log_std")}
+        layers = {f"hidden.{i}": (out, into) for i, (into, out) in enumerate(pairwise(widths))}
+        layers |= dict.fromkeys(("mean", "log_std"), (self.action_dim, widths[-1]))
         return {f"{name}.weight": shape for name, shape in layers.items()} | {
             f"{name}.bias": shape[:1] for name, shape in layers.items()
         }
@@ -113,15 +114,15 @@ def read_snapshot(folder: Path, step: int) -> Snapshot:
         values = parse_json((folder / "policy.json").read_bytes())
         description = _DESCRIPTION.validate_json(canonical_json(values))
     except (OSError, ValueError, ValidationError) as error:
-        raise SnapshotError(f"{folder / 'policy.json'}: not a policy description ({_one_line(error)})") from None
+        raise SnapshotError(
+            f"{folder / 'policy.json'}: not a policy description ({_one_line(error)})"
+        ) from None
     if isinstance(description, ScriptedPolicy):
         return Snapshot(step, description)
     return Snapshot(step, description, _read_tensors(folder / "policy.safetensors", description.shapes()))
 
 
-def _read_tensors(
-    file: Path, shapes: Mapping[str, tuple[int, ...]]
-) -> dict[str, npt.NDArray[np.float32]]:
+def _read_tensors(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, npt.NDArray[np.float32]]:
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
@@ -149,7 +150,10 @@ def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
     """The actor of a Stable-Baselines3 SAC as a snapshot."""
     actor = model.policy.actor
     layers = [layer for layer in actor.latent_pi if hasattr(layer, "weight")]
-    named = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {"mean": actor.mu, "log_std": actor.log_std}
+    named = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {
+        "mean": actor.mu,
+        "log_std": actor.log_std,
+    }
     tensors = {
         f"{name}.{kind}": getattr(layer, kind).detach().cpu().numpy().copy()
         for name, layer in named.items()
@@ -159,7 +163,7 @@ def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
         observation=observation,
         observation_dim=int(tensors["hidden.0.weight"].shape[1]),
         action_dim=int(tensors["mean.weight"].shape[0]),
-        hidden=tuple(int(layer.out_features) for layer in layers),
+        hidden=tuple(tensors[f"hidden.{i}.bias"].size for i in range(len(layers))),
     )
     return Snapshot(step, description, tensors)
 
@@ -168,25 +172,25 @@ def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
 class GaussianController(Controller):
     """tanh(mean + std * noise), computed as Stable-Baselines3's SAC actor computes it."""
 
-    def __init__(
-        self, description: GaussianPolicy, tensors: Mapping[str, npt.NDArray[np.float32]]
-    ) -> None:
+    def __init__(self, description: GaussianPolicy, tensors: Mapping[str, npt.NDArray[np.float32]]) -> None:
         import torch
 
         self.view = description.observation
         self._hidden = range(len(description.hidden))
-        self._tensors = {name: torch.from_numpy(array.copy()) for name, array in tensors.items()}
+        self._tensors = {name: torch.tensor(array) for name, array in tensors.items()}
 
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         import torch
 
         with torch.inference_mode():
-            features = torch.from_numpy(observations.astype(np.float32))
+            features = torch.tensor(observations, dtype=torch.float32)
             for i in self._hidden:
                 features = torch.relu(self._linear(f"hidden.{i}", features))
             mean = self._linear("mean", features)
             std = torch.clamp(self._linear("log_std", features), *LOG_STD_RANGE).exp()
-            return torch.tanh(mean + torch.from_numpy(noise) * std).numpy()
+            squashed = torch.tanh(mean + torch.from_numpy(noise) * std).numpy()
+        # Stable-Baselines3 scales actions to the box [-1, 1] even where that only rounds the last bit
+        return -1.0 + 0.5 * (squashed + 1.0) * 2.0
 
     def _linear(self, name: str, features: "torch.Tensor") -> "torch.Tensor":
         from torch.nn.functional import linear

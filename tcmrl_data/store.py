@@ -7,38 +7,41 @@ next observations are never stored twice.
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import product
+from itertools import pairwise, product
 from math import ceil, prod
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from tcmrl_data.canonical import canonical_json, parse_json, sha256
 from tcmrl_data.errors import StoreError
 from tcmrl_data.trajectory import Trajectory
 
-Arrays = Mapping[str, npt.NDArray[np.generic]]
+Arrays = Mapping[str, npt.NDArray[Any]]
 
 CHUNK_BYTES = 16 * 10**6
 """An array stays one chunk below this size (16 MB); above it, chunks are blocks of rows."""
 
 STEP_ARRAYS = ("actions", "rewards", "terminated", "truncated")
-DTYPES = {"float32": np.float32, "int64": np.int64, "bool": np.bool_}
+METADATA_BYTES = 2**16
+MAX_CHUNKS = 10**6
 GROUP = canonical_json({"zarr_format": 3, "node_type": "group", "attributes": {}})
 _CODECS = (
     {"name": "bytes", "configuration": {"endian": "little"}},
     {"name": "zstd", "configuration": {"level": 3, "checksum": False}},
     {"name": "crc32c"},
 )
+_ONE_BYTE_CODECS = ({"name": "bytes"}, *_CODECS[1:])
 
 
-def pack(trajectories: Sequence[Trajectory]) -> dict[str, npt.NDArray[np.generic]]:
+def pack(trajectories: Sequence[Trajectory]) -> dict[str, npt.NDArray[Any]]:
     """Flat arrays of a part: floats as float32, flags as bool, `episode_offsets` int64 (episodes + 1)."""
     lengths = [len(trajectory) for trajectory in trajectories]
     floats = ("observations", "actions", "rewards")
-    arrays: dict[str, npt.NDArray[np.generic]] = {
+    arrays: dict[str, npt.NDArray[Any]] = {
         name: np.concatenate([getattr(each, name) for each in trajectories]).astype(
             np.float32 if name in floats else np.bool_
         )
@@ -64,10 +67,13 @@ def unpack(arrays: Arrays) -> list[Trajectory]:
     return [
         Trajectory(
             arrays["observations"][start + episode : stop + episode + 1],
-            *(arrays[name][start:stop] for name in STEP_ARRAYS),
+            arrays["actions"][start:stop],
+            arrays["rewards"][start:stop],
+            arrays["terminated"][start:stop],
+            arrays["truncated"][start:stop],
             {name: arrays[name][start:stop] for name in extras},
         )
-        for episode, (start, stop) in enumerate(zip(offsets[:-1], offsets[1:], strict=True))
+        for episode, (start, stop) in enumerate(pairwise(offsets))
     ]
 
 
@@ -95,7 +101,7 @@ def write_arrays(folder: Path, arrays: Arrays) -> None:
         )
 
 
-def read_arrays(folder: Path, names: Iterable[str]) -> dict[str, npt.NDArray[np.generic]]:
+def read_arrays(folder: Path, names: Iterable[str]) -> dict[str, npt.NDArray[Any]]:
     """Decodes arrays of a part.
 
     Raises:
@@ -125,10 +131,10 @@ def array_files(folder: Path, name: str) -> list[str]:
     Raises:
         StoreError: the `zarr.json` is missing or outside the allow-list.
     """
-    shape, chunks, _ = _array_metadata(folder / name / "zarr.json")
-    grid = [range(ceil(size / chunk)) for size, chunk in zip(shape, chunks, strict=True)]
-    if prod(len(axis) for axis in grid) > 10**6:
-        raise StoreError(f"{folder / name / 'zarr.json'}: chunks {chunks} of shape {shape} are too many")
+    metadata = _read_metadata(_ArrayMetadata, folder / name / "zarr.json")
+    grid = [range(ceil(size / chunk)) for size, chunk in zip(metadata.shape, metadata.chunks, strict=True)]
+    if prod(len(axis) for axis in grid) > MAX_CHUNKS:
+        raise StoreError(f"{folder / name / 'zarr.json'}: more than {MAX_CHUNKS} chunks")
     chunk_files = ["/".join(map(str, ("c", *index))) for index in product(*grid)]
     return [f"{name}/{file}" for file in ("zarr.json", *chunk_files)]
 
@@ -155,62 +161,79 @@ def check_layout(folder: Path, arrays: Mapping[str, Mapping[str, Any]]) -> None:
     Raises:
         StoreError: names the file and the field.
     """
-    _group_metadata(folder / "zarr.json")
+    _read_metadata(_GroupMetadata, folder / "zarr.json")
     for name, record in arrays.items():
         file = folder / name / "zarr.json"
-        shape, _, dtype = _array_metadata(file)
-        if list(shape) != list(record["shape"]) or dtype != record["dtype"]:
+        metadata = _read_metadata(_ArrayMetadata, file)
+        if metadata.data_type != record["dtype"] or list(metadata.shape) != list(record["shape"]):
             raise StoreError(
-                f"{file}: {dtype}{list(shape)} is not what part.json records, "
+                f"{file}: {metadata.data_type}{list(metadata.shape)} is not what part.json records, "
                 f"{record['dtype']}{list(record['shape'])}"
             )
 
 
-def _read_metadata(file: Path, keys: set[str]) -> dict[str, Any]:
+class _Metadata(BaseModel):
+    """What every `zarr.json` of a part may say."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    zarr_format: Literal[3]
+    attributes: dict[str, Any] = Field(default={}, max_length=0)
+
+
+class _GroupMetadata(_Metadata):
+    node_type: Literal["group"]
+
+
+class _ChunkShape(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    chunk_shape: tuple[Annotated[int, Field(ge=1, lt=2**40)], ...]
+
+
+class _ChunkGrid(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+
+    name: Literal["regular"]
+    configuration: _ChunkShape
+
+
+class _ArrayMetadata(_Metadata):
+    node_type: Literal["array"]
+    data_type: Literal["float32", "int64", "bool"]
+    shape: tuple[Annotated[int, Field(ge=0, lt=2**40)], ...] = Field(min_length=1, max_length=2)
+    chunk_grid: _ChunkGrid
+    chunk_key_encoding: dict[str, Any]
+    codecs: tuple[dict[str, Any], ...]
+    fill_value: str | float | bool
+    storage_transformers: tuple[Any, ...] = Field(default=(), max_length=0)
+
+    @property
+    def chunks(self) -> tuple[int, ...]:
+        return self.chunk_grid.configuration.chunk_shape
+
+    @model_validator(mode="after")
+    def _as_written_here(self) -> "_ArrayMetadata":
+        if len(self.chunks) != len(self.shape):
+            raise ValueError(f"chunk_grid {self.chunks} does not fit shape {self.shape}")
+        if self.chunk_key_encoding != {"name": "default", "configuration": {"separator": "/"}}:
+            raise ValueError(f"chunk_key_encoding {self.chunk_key_encoding} is not allowed")
+        if self.codecs not in (_CODECS, _ONE_BYTE_CODECS):
+            raise ValueError(f"codecs {str(self.codecs)[:200]} are not allowed")
+        return self
+
+
+Metadata = TypeVar("Metadata", bound=_Metadata)
+
+
+def _read_metadata(kind: type[Metadata], file: Path) -> Metadata:
     try:
-        if file.stat().st_size > 2**16:
+        if file.stat().st_size > METADATA_BYTES:
             raise StoreError(f"{file}: larger than any zarr.json of a part")
-        metadata = parse_json(file.read_bytes())
+        return kind.model_validate_json(canonical_json(parse_json(file.read_bytes())))
+    except ValidationError as error:
+        detail = error.errors()[0]
+        field = ".".join(map(str, detail["loc"])) or "values"
+        raise StoreError(f"{file}: {field}: {detail['msg']}") from None
     except (OSError, ValueError) as error:
         raise StoreError(f"{file}: not readable as zarr.json ({error})") from None
-    if not isinstance(metadata, dict) or metadata.get("zarr_format") != 3:
-        raise StoreError(f"{file}: zarr_format must be 3")
-    unknown = sorted(set(metadata) - keys)
-    if unknown:
-        raise StoreError(f"{file}: field {unknown[0]!r} is not allowed")
-    return metadata
-
-
-def _group_metadata(file: Path) -> None:
-    metadata = _read_metadata(file, {"zarr_format", "node_type", "attributes"})
-    if metadata.get("node_type") != "group" or metadata.get("attributes") not in (None, {}):
-        raise StoreError(f"{file}: must be a group without attributes")
-
-
-def _array_metadata(file: Path) -> tuple[tuple[int, ...], tuple[int, ...], str]:
-    """Shape, chunk shape and dtype of an allowed array."""
-    allowed = "zarr_format node_type attributes shape data_type chunk_grid chunk_key_encoding fill_value codecs"
-    metadata = _read_metadata(file, {*allowed.split(), "storage_transformers"})
-
-    def require(field: str, ok: bool) -> None:
-        if not ok:
-            raise StoreError(f"{file}: {field} {str(metadata.get(field))[:80]} is not allowed")
-
-    def is_shape(value: object, least: int) -> bool:
-        return isinstance(value, list) and all(type(n) is int and least <= n < 2**40 for n in value)
-
-    require("node_type", metadata.get("node_type") == "array")
-    require("attributes", metadata.get("attributes") in (None, {}))
-    require("storage_transformers", metadata.get("storage_transformers") in (None, []))
-    require("data_type", metadata.get("data_type") in DTYPES)
-    shape, grid = metadata.get("shape"), metadata.get("chunk_grid")
-    require("shape", is_shape(shape, 0) and 1 <= len(shape) <= 2)
-    require("chunk_grid", isinstance(grid, dict) and grid.get("name") == "regular")
-    chunks = grid.get("configuration", {}).get("chunk_shape")
-    require("chunk_grid", is_shape(chunks, 1) and len(chunks) == len(shape))
-    default_keys = {"name": "default", "configuration": {"separator": "/"}}
-    require("chunk_key_encoding", metadata.get("chunk_key_encoding") == default_keys)
-    codecs = metadata.get("codecs")
-    plain_bytes = ({"name": "bytes"}, *_CODECS[1:])  # one-byte types have no byte order
-    require("codecs", isinstance(codecs, list) and tuple(codecs) in (_CODECS, plain_bytes))
-    return tuple(shape), tuple(chunks), metadata["data_type"]

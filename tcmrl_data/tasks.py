@@ -33,9 +33,9 @@ def draw_tasks(environment: Environment) -> tuple[Task, ...]:
     """All tasks of an environment, a function of its settings alone (its `task_seed`, never `--seed`)."""
     settings = environment.settings
     parameters = environment.draw_parameters(settings.tasks, settings.task_seed)
-    permutation = keyed_generator(
-        settings.task_seed, environment.name, NO_TASK, Purpose.SPLIT
-    ).permutation(settings.tasks)
+    permutation = keyed_generator(settings.task_seed, environment.name, NO_TASK, Purpose.SPLIT).permutation(
+        settings.tasks
+    )
     train = set(permutation[: settings.train].tolist())
     return tuple(
         Task(index, "train" if index in train else "test", parameters[index])

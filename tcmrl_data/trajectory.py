@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -40,7 +41,7 @@ class Trajectory:
     rewards: FloatArray
     terminated: BoolArray
     truncated: BoolArray
-    extras: Mapping[str, npt.NDArray[np.generic]] = field(default_factory=dict)
+    extras: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         steps = len(self.actions)

@@ -138,7 +138,9 @@ class _TaskRoller:
         if (target / "part.json").is_file():
             record = read_part_record(target / "part.json")
             if record.identity.policy != snapshot.digest():
-                raise NondeterminismError(f"{target}: its policy differs from the one trained now with the same seed")
+                raise NondeterminismError(
+                    f"{target}: its policy differs from the one trained now with the same seed"
+                )
             return record.id
         with stage(dataset, f"task_{self.task.index:05d}") as staged:
             part_id = self._write(staged, snapshot)
@@ -146,7 +148,9 @@ class _TaskRoller:
             if not publish_folder(staged, target):
                 published = read_part_record(target / "part.json").id
                 if published != part_id:
-                    raise NondeterminismError(f"{target}: published with id {published}, made again with {part_id}")
+                    raise NondeterminismError(
+                        f"{target}: published with id {published}, made again with {part_id}"
+                    )
         report({"kind": "part", "task": self.task.index, "step": snapshot.step, "id": part_id})
         return part_id
 
@@ -170,7 +174,10 @@ class _TaskRoller:
             step=snapshot.step,
             seed=spec.seed,
             policy=snapshot.digest(),
-            arrays={name: ArrayRecord.model_validate_json(canonical_json(each)) for name, each in array_digests(arrays).items()},
+            arrays={
+                name: ArrayRecord.model_validate_json(canonical_json(each))
+                for name, each in array_digests(arrays).items()
+            },
         )
         record = PartRecord(
             schema_version=SCHEMA_VERSION,
@@ -268,7 +275,9 @@ def file_records(folder: Path) -> dict[str, FileRecord]:
     """Size and sha256 of every file below a folder."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
     return {
-        path.relative_to(folder).as_posix(): FileRecord(size=path.stat().st_size, sha256=sha256(path.read_bytes()))
+        path.relative_to(folder).as_posix(): FileRecord(
+            size=path.stat().st_size, sha256=sha256(path.read_bytes())
+        )
         for path in files
     }
 

@@ -4,7 +4,7 @@ import abc
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
-from tcmrl_data.environment import Environment, View
+from tcmrl_data.environment import Environment, Reward, View
 from tcmrl_data.snapshot import Snapshot
 from tcmrl_data.tasks import Task
 
@@ -26,7 +26,7 @@ class BehaviorContext:
     tasks: Sequence[Task]
     seed: int
     observation: View
-    reward: str
+    reward: Reward
     report: Callable[[int], None]
 
 

@@ -1,6 +1,7 @@
 """One Stable-Baselines3 SAC per task: its own replay buffer, entropy coefficient and seed."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, Literal, final
 
 import gymnasium
@@ -102,7 +103,7 @@ class Source(BehaviorSource):
             return True
 
         yield snapshot_of_sac(model, step=0, observation=context.observation)
-        for done, step in zip(settings.snapshots, settings.snapshots[1:], strict=False):
+        for done, step in pairwise(settings.snapshots):
             model.learn(step - done, callback=ConvertCallback(count), reset_num_timesteps=False)
             yield snapshot_of_sac(model, step=step, observation=context.observation)
 
@@ -112,8 +113,9 @@ class KeyedResets(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Resets the n-th training episode with its own keyed seed, so that episodes never depend on history."""
 
     def __init__(self, context: BehaviorContext, task: Task) -> None:
-        reward = "dense" if context.reward == "dense" else "stored"
-        super().__init__(context.environment.make(task.parameters, view=context.observation, reward=reward))
+        super().__init__(
+            context.environment.make(task.parameters, view=context.observation, reward=context.reward)
+        )
         self._key = (context.seed, context.environment.name, task.index, Purpose.BEHAVIOR_RESET)
         self._episode = 0
 

@@ -17,7 +17,7 @@ NAME = "local"
 ATTEMPTS = 2
 """A crashed or timed-out unit is run once more; an error that the unit reports itself is final."""
 
-ONE_THREAD = {name: "1" for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 
 
 @final
@@ -66,12 +66,13 @@ def _run_attempts(
     running: set[subprocess.Popen[str]],
     stopping: threading.Event,
 ) -> Result:
-    for attempt in range(1, ATTEMPTS + 1):
+    attempt = 0
+    final_message, failure = None, "stopped before it started"
+    while final_message is None and attempt < ATTEMPTS and not stopping.is_set():
+        attempt += 1
         final_message, failure = _run_once(unit, events, running)
-        if final_message is not None or stopping.is_set():
-            break
     reported = final_message or {}
-    error = None if reported.get("digest") else reported.get("error") or failure
+    error = None if reported.get("digest") else reported.get("error", failure)
     return Result(unit.id, error is None, reported.get("digest"), error, attempt, socket.gethostname())
 
 
@@ -82,21 +83,23 @@ def _run_once(
 ) -> tuple[Mapping[str, Any] | None, str]:
     """The unit's own last word, or None and why there is none."""
     last: Mapping[str, Any] | None = None
-    with tempfile.TemporaryFile("w+") as errors:
-        process = subprocess.Popen(
+    with (
+        tempfile.TemporaryFile("w+") as errors,
+        subprocess.Popen(
             [sys.executable, "-m", "tcmrl_data.engine.worker"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,
             text=True,
             env=os.environ | ONE_THREAD,
-        )
+        ) as process,
+    ):
         running.add(process)
-        timer = threading.Timer(unit.timeout, process.kill) if unit.timeout else None
-        if timer:
-            timer.start()
+        timer = threading.Timer(unit.timeout or threading.TIMEOUT_MAX, process.kill)
+        timer.start()
+        assert process.stdin is not None
+        assert process.stdout is not None
         try:
-            assert process.stdin is not None and process.stdout is not None
             process.stdin.write(json.dumps(unit.spec) + "\n")
             process.stdin.flush()
             for line in process.stdout:
@@ -108,10 +111,9 @@ def _run_once(
         except BrokenPipeError:
             pass  # the worker died before it read its spec; its exit code says how
         finally:
+            timer.cancel()
             code = process.wait()
             running.discard(process)
-            if timer:
-                timer.cancel()
         errors.seek(0)
         lines = errors.read().strip().splitlines()
     return last, f"worker ended with code {code}: {lines[-1] if lines else 'no message'}"

@@ -5,12 +5,12 @@ Definition as in MAML, PEARL and FOCAL, on Gymnasium's HalfCheetah-v5 model: rew
 Observations are Gymnasium's, 17 values without the absolute x; FOCAL and CSRO add the torso's position.
 """
 
-from typing import Any, Literal, final
+from typing import Any, final
 
 import numpy as np
 from pydantic import Field, model_validator
 
-from tcmrl_data.environment import Environment, EnvironmentSettings, Parameters, View
+from tcmrl_data.environment import Environment, EnvironmentSettings, Parameters, Reward, View
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint, squared_norm
 from tcmrl_data.trajectory import FloatArray
 
@@ -52,7 +52,7 @@ class HalfCheetahVel(Environment):
         return [{"velocity": float(each)} for each in random.uniform(low, high, num_tasks)]
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Literal["stored", "dense"] = "stored"
+        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> "HalfCheetahVelTask":
         return HalfCheetahVelTask(float(parameters["velocity"]), self.settings)
 

@@ -10,13 +10,13 @@ import functools
 import pickle
 import warnings
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal, final
+from typing import Any, ClassVar, final
 
 import gymnasium
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.environment import Controller, Environment, EnvironmentSettings, Parameters, View
+from tcmrl_data.environment import Controller, Environment, EnvironmentSettings, Parameters, Reward, View
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint
 from tcmrl_data.errors import TaskError
 from tcmrl_data.trajectory import FloatArray
@@ -68,7 +68,7 @@ class MetaWorldML1(Environment):
         ]
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Literal["stored", "dense"] = "stored"
+        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> "MetaWorldML1Task":
         if parameters["env_name"] != self._env_name:
             raise TaskError(

@@ -18,6 +18,7 @@ from tcmrl_data.environment import (
     Lanes,
     LaneStep,
     Parameters,
+    Reward,
     View,
 )
 from tcmrl_data.trajectory import BoolArray, FloatArray
@@ -48,12 +49,12 @@ class _PointRobot(Environment):
     action_dim = 2
     settings: PointRobotSettings
 
-    def rewards(self, distances: FloatArray, reward: Literal["stored", "dense"]) -> FloatArray:
+    def rewards(self, distances: FloatArray, reward: Reward) -> FloatArray:
         """Rewards (...,) for distances to the goal (...,) after the move."""
         return -distances
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Literal["stored", "dense"] = "stored"
+        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> "PointRobotEnv":
         return PointRobotEnv(PointRobotLanes(self, [parameters], reward))
 
@@ -79,7 +80,7 @@ class SparsePointRobot(_PointRobot):
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         return half_circle_goals(num_tasks)
 
-    def rewards(self, distances: FloatArray, reward: Literal["stored", "dense"]) -> FloatArray:
+    def rewards(self, distances: FloatArray, reward: Reward) -> FloatArray:
         if reward == "dense":
             return -distances
         radius = self.settings.goal_radius
@@ -127,9 +128,7 @@ class GreedyController(Controller):
 class PointRobotLanes(Lanes):
     """Any number of point robots as one NumPy batch."""
 
-    def __init__(
-        self, environment: _PointRobot, parameters: Sequence[Parameters], reward: Literal["stored", "dense"]
-    ) -> None:
+    def __init__(self, environment: _PointRobot, parameters: Sequence[Parameters], reward: Reward) -> None:
         self.num_lanes = len(parameters)
         self._environment, self._reward = environment, reward
         self._goals, self._winds = goals_and_winds(parameters)
@@ -149,6 +148,9 @@ class PointRobotLanes(Lanes):
         rewards = np.where(active, self._environment.rewards(distances, self._reward), 0.0)
         truncated = active & (self._steps >= self._environment.settings.horizon)
         return LaneStep(self._positions.copy(), rewards, np.zeros_like(truncated), truncated, {})
+
+    def close(self) -> None:
+        pass
 
 
 @final

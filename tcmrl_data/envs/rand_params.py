@@ -18,7 +18,7 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.environment import Environment, EnvironmentSettings, Parameters, View
+from tcmrl_data.environment import Environment, EnvironmentSettings, Parameters, Reward, View
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint, squared_norm
 from tcmrl_data.errors import TaskError
 from tcmrl_data.trajectory import FloatArray
@@ -66,7 +66,7 @@ class _RandParams(Environment):
         return multipliers
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Literal["stored", "dense"] = "stored"
+        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> "RandParamsTask":
         simulator = self.simulator()
         simulator.model.opt.timestep = self.settings.timestep

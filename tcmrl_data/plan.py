@@ -1,0 +1,132 @@
+"""What a build will take: tasks, parts, environment steps, bytes, and a time measured by a short probe."""
+
+import math
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from tcmrl_data.behavior import BehaviorContext
+from tcmrl_data.environment import Environment, UniformController
+from tcmrl_data.recipe import Recipe
+from tcmrl_data.rollout import roll_out
+from tcmrl_data.seeding import Purpose, keyed_generator, keyed_seed
+from tcmrl_data.tasks import Task, choose_tasks
+from tcmrl_data.unit import behavior_source
+
+PROBE_SECONDS = 6.0
+UNIT_START_SECONDS = 3.0
+"""Starting a worker process, mostly importing torch; measured as 2 to 4 s."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A build before it starts.
+
+    Attributes:
+        training_steps: environment steps of behavior training, all tasks together.
+        rollout_steps: stored environment steps, at most; episodes may end early.
+        bytes: size of the arrays before compression, an upper bound.
+        seconds: estimated wall time with `workers` processes on this machine.
+    """
+
+    environment: str
+    profile: str
+    behavior: str
+    tasks: int
+    train: int
+    test: int
+    snapshots: int
+    parts: int
+    episodes: int
+    training_steps: int
+    rollout_steps: int
+    bytes: int
+    workers: int
+    seconds: float
+
+
+class _ProbeOverError(Exception):
+    """Ends behavior training once enough has been measured."""
+
+
+def plan_build(recipe: Recipe, *, tasks: Sequence[int] | None = None, workers: int | None = None) -> Plan:
+    """Plans a build and measures this machine for a few seconds.
+
+    Raises:
+        TaskError: an index outside the task set.
+    """
+    chosen = choose_tasks(recipe, tasks)
+    environment, source = recipe.make_environment(), behavior_source(recipe)
+    workers = workers or os.cpu_count() or 1
+    episodes, horizon = recipe.rollouts.episodes, environment.settings.horizon
+    parts = len(chosen) * len(source.steps)
+    row_bytes = 4 * (environment.observation_dim + environment.action_dim + 1) + 2
+    unit_seconds = (
+        UNIT_START_SECONDS
+        + source.training_steps * _training_seconds_per_step(recipe, environment, chosen[0])
+        + len(source.steps) * episodes * _seconds_per_episode(recipe, environment, chosen[0])
+    )
+    return Plan(
+        environment=environment.name,
+        profile=recipe.profile,
+        behavior=recipe.behavior["source"],
+        tasks=len(chosen),
+        train=sum(task.split == "train" for task in chosen),
+        test=sum(task.split == "test" for task in chosen),
+        snapshots=len(source.steps),
+        parts=parts,
+        episodes=parts * episodes,
+        training_steps=len(chosen) * source.training_steps,
+        rollout_steps=parts * episodes * horizon,
+        bytes=parts * episodes * (horizon + 1) * row_bytes,
+        workers=workers,
+        seconds=unit_seconds * math.ceil(len(chosen) / workers),
+    )
+
+
+def _training_seconds_per_step(recipe: Recipe, environment: Environment, task: Task) -> float:
+    """Measured on a real training of the task, at the end of the probe, when the warm-up is over."""
+    marks: list[tuple[float, int]] = []
+    started = time.monotonic()
+
+    def report(count: int) -> None:
+        now = time.monotonic()
+        marks.append((now, count))
+        if now - started > PROBE_SECONDS:
+            raise _ProbeOverError
+
+    context = BehaviorContext(
+        environment=environment,
+        tasks=[task],
+        seed=0,
+        observation=recipe.behavior["observation"],
+        reward=recipe.behavior["reward"],
+        report=report,
+    )
+    try:
+        for _ in behavior_source(recipe).snapshots(context):
+            pass
+    except _ProbeOverError:
+        pass
+    late = [mark for mark in marks if mark[0] > started + PROBE_SECONDS / 2] or marks
+    if len(late) < 2:
+        return 0.0 if not marks else (marks[-1][0] - started) / sum(count for _, count in marks)
+    return (late[-1][0] - late[0][0]) / sum(count for _, count in late[1:])
+
+
+def _seconds_per_episode(recipe: Recipe, environment: Environment, task: Task) -> float:
+    """Measured on one lane batch of uniform actions; a policy's own cost is small beside it."""
+    num_lanes = recipe.rollouts.lanes
+    lanes = environment.lanes([task.parameters] * num_lanes)
+    key = (0, environment.name, task.index)
+    started = time.monotonic()
+    roll_out(
+        environment,
+        lanes,
+        UniformController(),
+        reset_seeds=[keyed_seed(*key, Purpose.REFERENCE_RESET, lane) for lane in range(num_lanes)],
+        noise=[keyed_generator(*key, Purpose.REFERENCE_NOISE, lane) for lane in range(num_lanes)],
+    )
+    lanes.close()
+    return (time.monotonic() - started) / num_lanes

@@ -1,0 +1,143 @@
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import tcmrl_data
+from tcmrl_data import Dataset, Recipe, load_recipe, open_dataset
+from tcmrl_data.errors import BuildError, LockedError, ManifestError, StoreError
+from tcmrl_data.manifest import MANIFEST, read_manifest
+from tcmrl_data.publish import LOCK, lock_file
+from tests.conftest import TASKS, TINY
+
+Copy = Callable[[], Path]
+
+
+def ids(folder: Path) -> dict[tuple[int, int], str]:
+    return {(part.task, part.step): part.id for part in read_manifest(folder).parts}
+
+
+def test_ids_do_not_depend_on_workers_halves_or_training_defaults(tiny_folder: Path, tmp_path: Path) -> None:
+    edited = load_recipe("point-robot", profile="quick", overrides=[*TINY, "training.steps=17"])
+    for half in ([0, 40], [99, 3, 60]):
+        tcmrl_data.build_dataset(edited, tmp_path / "halves", tasks=half, workers=1)
+    assert ids(tmp_path / "halves") == ids(tiny_folder)
+    assert read_manifest(tmp_path / "halves").root == read_manifest(tiny_folder).root
+    assert read_manifest(tmp_path / "halves").training["quick"]["steps"] == 17
+
+
+def test_another_seed_has_other_data_for_the_same_tasks(
+    tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    tcmrl_data.build_dataset(tiny_recipe, tmp_path / "other", seed=1, tasks=[0, 3], workers=2)
+    other = open_dataset(tmp_path / "other")
+    assert not {part.id for part in other.manifest.parts} & {part.id for part in tiny.manifest.parts}
+    assert [other.task(index) for index in (0, 3)] == [tiny.task(index) for index in (0, 3)]
+
+
+def test_a_finished_dataset_is_verified_and_left_alone(tiny_copy: Copy, tiny_recipe: Recipe) -> None:
+    folder = tiny_copy()
+    before = {
+        path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file() and path.name != LOCK
+    }
+    report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+    after = {
+        path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file() and path.name != LOCK
+    }
+    assert (report.built, report.present) == (0, 15)
+    assert before == after
+
+
+def test_a_second_build_does_only_what_is_missing(
+    tiny_copy: Copy, tiny_recipe: Recipe, tiny_folder: Path
+) -> None:
+    folder = tiny_copy()
+    lost = open_dataset(folder).folder_of(40, 150)
+    subprocess.run(["rm", "-r", str(lost)], check=True)
+    report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS, workers=1)
+    assert (report.built, report.present) == (1, 14)
+    assert ids(folder) == ids(tiny_folder)
+
+
+def test_a_killed_build_resumes_to_the_same_data(tiny_folder: Path, tmp_path: Path) -> None:
+    out = tmp_path / "killed"
+    script = (
+        "import sys, tcmrl_data; from pathlib import Path; from tests.conftest import TINY, TASKS;"
+        "recipe = tcmrl_data.load_recipe('point-robot', profile='quick', overrides=TINY);"
+        "tcmrl_data.build_dataset(recipe, Path(sys.argv[1]), tasks=TASKS, workers=2)"
+    )
+    root = Path(__file__).parents[1]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
+    driver = subprocess.Popen([sys.executable, "-c", script, str(out)], cwd=root, env=environment)
+    deadline = time.monotonic() + 60
+    while not list(out.glob("tasks/*/snapshots/*/part.json")) and time.monotonic() < deadline:
+        time.sleep(0.01)
+    driver.kill()
+    driver.wait()
+    subprocess.run([sys.executable, "-c", script, str(out)], cwd=root, env=environment, check=True)
+    assert ids(out) == ids(tiny_folder)
+    assert read_manifest(out).complete
+
+
+def test_another_recipe_or_seed_is_refused(tiny_copy: Copy, tiny_recipe: Recipe) -> None:
+    folder = tiny_copy()
+    other = load_recipe("point-robot", profile="quick", overrides=[*TINY, "behavior.sac.gamma=0.5"])
+    with pytest.raises(BuildError, match=r"behavior.settings.gamma is 0.9 there and 0.5 here"):
+        tcmrl_data.build_dataset(other, folder, tasks=TASKS)
+    with pytest.raises(BuildError, match="seed 0, not 4"):
+        tcmrl_data.build_dataset(tiny_recipe, folder, seed=4)
+
+
+def test_a_folder_that_is_no_dataset_is_refused(tmp_path: Path, tiny_recipe: Recipe) -> None:
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(BuildError, match="no dataset"):
+        tcmrl_data.build_dataset(tiny_recipe, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_two_builders_at_once_one_is_refused_by_name(tiny_copy: Copy, tiny_recipe: Recipe) -> None:
+    folder = tiny_copy()
+    with lock_file(folder / LOCK, "the dataset"), pytest.raises(LockedError, match=f"process {os.getpid()}"):
+        tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+
+
+@pytest.mark.parametrize("name", ["rewards/c/0", "policy.safetensors", "observations/zarr.json"])
+def test_a_flipped_bit_stops_the_build_and_names_the_file(
+    tiny_copy: Copy, tiny_recipe: Recipe, name: str
+) -> None:
+    folder = tiny_copy()
+    file = folder / "tasks/00003/snapshots/step_0000100" / name
+    data = bytearray(file.read_bytes())
+    data[len(data) // 2] ^= 1
+    file.write_bytes(data)
+    with pytest.raises((StoreError, ManifestError), match=str(file)):
+        tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+
+
+def test_a_failing_unit_is_reported_and_the_others_are_done(tmp_path: Path, tiny_recipe: Recipe) -> None:
+    """A file in the place of one task's part makes that unit fail for good."""
+    out = tmp_path / "poisoned"
+    blocked = out / "tasks/00003/snapshots"
+    blocked.mkdir(parents=True)
+    (blocked / "step_0000100").write_text("in the way")
+    report = tcmrl_data.build_dataset(tiny_recipe, out, tasks=[0, 3], workers=2)
+    assert [failure.split(" failed")[0] for failure in report.failed] == ["task 3"]
+    assert not read_manifest(out).complete
+    assert set(ids(out)) == {(0, 0), (0, 100), (0, 150), (3, 0)}
+
+
+def test_the_manifest_is_its_canonical_form(tiny_folder: Path) -> None:
+    data = (tiny_folder / MANIFEST).read_bytes()
+    values = json.loads(data)
+    assert tcmrl_data.canonical_json(values) == data
+    assert values["tasks"][1] == {
+        "index": 3,
+        "split": "test",
+        "parameters": {"goal": [0.9954719225730846, 0.09505604330418267], "wind": [0.0, 0.0]},
+    }
+    assert values["references"]["3"]["oracle"] > values["references"]["3"]["uniform"]

@@ -1,0 +1,56 @@
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tcmrl_data import load_recipe
+from tcmrl_data.errors import TaskError
+from tcmrl_data.tasks import Task, choose_tasks, draw_tasks, parse_indices, spread
+
+
+def test_the_split_never_moves() -> None:
+    """Recorded once: a change here silently mixes training and test tasks of published datasets."""
+    tasks = draw_tasks(load_recipe("point-robot-wind").make_environment())
+    assert [task.index for task in tasks if task.split == "test"] == [12, 15, 16, 17, 18, 19, 22, 26, 28, 44]
+
+
+@given(st.integers(2, 20), st.integers(1, 10))
+def test_spread_keeps_splits_apart_and_takes_the_ends(num_train: int, num_test: int) -> None:
+    tasks = [Task(index, "test" if index % 5 == 2 else "train", {}) for index in range(60)]
+    chosen = spread(tasks, num_train=num_train, num_test=num_test)
+    splits = [tasks[index].split for index in chosen]
+    assert len(set(chosen)) == len(chosen) == num_train + num_test
+    assert splits.count("train") == num_train
+    assert {0, 59} <= set(chosen)
+
+
+def test_asking_for_more_tasks_than_there_are() -> None:
+    with pytest.raises(TaskError, match="3 test tasks asked for, the task set has 1"):
+        spread([Task(0, "train", {}), Task(1, "test", {})], num_train=1, num_test=3)
+
+
+def test_indices_mean_the_same_task_in_every_profile() -> None:
+    full = choose_tasks(load_recipe("point-robot"))
+    quick = choose_tasks(load_recipe("point-robot", profile="quick"))
+    assert len(full) == 100
+    assert all(full[task.index] == task for task in quick)
+    assert choose_tasks(load_recipe("point-robot", profile="quick"), [12, 5]) == [full[5], full[12]]
+
+
+def test_parameters_follow_the_task_seed_alone() -> None:
+    first, other = (
+        choose_tasks(load_recipe("point-robot-wind", overrides=[f"environment.task_seed={seed}"]), [0])
+        for seed in (1337, 7)
+    )
+    assert first[0].parameters["wind"] == pytest.approx([-0.02380, 0.03360], abs=1e-5)  # as published
+    assert other[0].parameters != first[0].parameters
+
+
+@pytest.mark.parametrize(("text", "expected"), [("0-3,9", [0, 1, 2, 3, 9]), ("7", [7]), ("2, 1,2", [1, 2])])
+def test_index_lists(text: str, expected: list[int]) -> None:
+    assert parse_indices(text, 10) == expected
+
+
+@pytest.mark.parametrize("text", ["", "a", "3-", "-3", "5-2", "10", "0-10", "1.5", "²"])
+def test_bad_index_lists_are_named(text: str) -> None:
+    with pytest.raises(TaskError, match="--tasks"):
+        parse_indices(text, 10)
