@@ -55,7 +55,7 @@ class Config(BaseModel):
     """The `[training.tcmrl]` table. K is `training.batch.window_length`.
 
     Attributes:
-        latent: size of representations and contexts (published code: 20; 40 for Walker).
+        latent: size of representations and contexts (paper, F.2: 20; 40 for Walker).
         encoder_hidden: widths of the context encoder (published code: 200 x 3).
         tce_hidden: widths of q (paper, F.2: 256); empty for the published code's linear layer.
         estimator_hidden: widths of the reward estimator (paper, F.2: layers of 256, their number not said).
