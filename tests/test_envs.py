@@ -3,6 +3,7 @@ import json
 import pickle
 import subprocess
 import sys
+from collections.abc import Sequence
 from typing import Any
 
 import gymnasium
@@ -60,7 +61,9 @@ def play(env: gymnasium.Env[Any, Any], actions: np.ndarray, *, seed: int) -> lis
     return episode
 
 
-def episodes(environment: Environment, controller: Controller, tasks: list[Parameters]) -> list[Trajectory]:
+def episodes(
+    environment: Environment, controller: Controller, tasks: Sequence[Parameters]
+) -> list[Trajectory]:
     lanes = environment.lanes(tasks)
     noise = [np.random.default_rng(lane) for lane in range(len(tasks))]
     return roll_out(environment, lanes, controller, reset_seeds=range(len(tasks)), noise=noise)
@@ -250,7 +253,7 @@ class Still(Controller):
 def test_a_cheetah_that_stands_still_returns_minus_305() -> None:
     environment, tasks = environment_of("half-cheetah-vel"), list(parameters_of("half-cheetah-vel"))
     velocities = np.array([each["velocity"] for each in tasks])
-    assert 0.0 <= velocities.min() and velocities.max() <= 3.0
+    assert velocities.min() >= 0.0 and velocities.max() <= 3.0
     returns = [each.undiscounted_return for each in episodes(environment, Still(), tasks)]
     assert np.mean(returns) == pytest.approx(-305, abs=2)
     assert returns == pytest.approx((-200 * velocities).tolist(), abs=30)
@@ -260,7 +263,8 @@ def test_cheetah_reward_is_distance_in_velocity_and_effort() -> None:
     from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 
     environment = environment_of("half-cheetah-vel")
-    env, stock = environment.make({"velocity": 1.25}), HalfCheetahEnv()
+    env = environment.make({"velocity": 1.25})
+    stock: Any = HalfCheetahEnv()
     assert np.array_equal(env.reset(seed=4)[0], stock.reset(seed=4)[0])
     x = stock.data.qpos[0]
     for action in actions_of(environment):
@@ -393,8 +397,9 @@ def test_a_task_is_ml1s_without_its_constructor(name: str, monkeypatch: pytest.M
     import metaworld.env_dict
 
     environment, task = environment_of(name), parameters_of(name)[11]
-    official_task = metaworld.ML1(task["env_name"], seed=1337).train_tasks[11]
-    official = metaworld.env_dict.ALL_V3_ENVIRONMENTS[task["env_name"]]()
+    benchmark: Any = metaworld.ML1
+    official_task = benchmark(task["env_name"], seed=1337).train_tasks[11]
+    official: Any = metaworld.env_dict.ALL_V3_ENVIRONMENTS[task["env_name"]]()
     official.set_task(official_task)
     assert pickle.loads(official_task.data)["rand_vec"].tolist() == task["rand_vec"]
     monkeypatch.setattr(metaworld, "ML1", None)  # a task must be made without the benchmark
