@@ -1,11 +1,12 @@
 """Every file operation that matters: staging, fsync, rename, lock, gc."""
 
 import contextlib
+import errno
 import fcntl
 import os
 import shutil
 import uuid
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from tcmrl_data.errors import LockedError
@@ -31,16 +32,28 @@ def sync_folder(path: Path) -> None:
         os.close(descriptor)
 
 
-def sync_tree(path: Path) -> None:
-    """Forces every file and folder below and including `path` to disk."""
-    for folder, _, files in os.walk(path, topdown=False):
-        for name in files:
-            descriptor = os.open(os.path.join(folder, name), os.O_RDONLY)
-            try:
-                os.fsync(descriptor)
-            finally:
-                os.close(descriptor)
-        sync_folder(Path(folder))
+def write_tree(folder: Path, files: Mapping[str, bytes]) -> None:
+    """Writes files (relative path to content) into a new folder and forces all of it to disk."""
+    folder.mkdir()
+    folders = {folder}
+    for name, data in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_file(path, data)
+        folders.update(parent for parent in path.parents if folder in parent.parents)
+    for each in sorted(folders, reverse=True):
+        sync_folder(each)
+
+
+def sync_tree(folder: Path) -> None:
+    """Forces everything below and including a folder to disk, for files that a library wrote."""
+    for path in folder.rglob("*"):
+        if path.is_file():
+            with path.open("rb") as file:
+                os.fsync(file.fileno())
+    for each in sorted([path for path in folder.rglob("*") if path.is_dir()], reverse=True):
+        sync_folder(each)
+    sync_folder(folder)
 
 
 def replace_file(dataset: Path, name: str, data: bytes) -> None:
@@ -53,31 +66,40 @@ def replace_file(dataset: Path, name: str, data: bytes) -> None:
     sync_folder(dataset)
 
 
-def publish_folder(staged: Path, target: Path) -> bool:
-    """Renames a synced staged folder to its final place; False where a folder stands there already."""
+def publish_folder(dataset: Path, target: Path, files: Mapping[str, bytes], *, attempt: str) -> bool:
+    """Makes a folder with the given files appear at `target` in one step.
+
+    Args:
+        dataset: folder whose staging area is used.
+        target: final place inside the dataset; its parent exists.
+        files: relative path to content.
+        attempt: names the staging folder, for people who look.
+
+    Returns:
+        False where a folder stands at `target` already; nothing is changed then.
+    """
+    staging = dataset / STAGING
+    staging.mkdir(exist_ok=True)
+    staged = staging / f"{attempt}.{uuid.uuid4().hex}"
+    with lock_file(staged.with_name(f"{staged.name}.lock"), "this attempt") as lock:
+        try:
+            write_tree(staged, files)
+            return move_into_place(staged, target)
+        finally:
+            shutil.rmtree(staged, ignore_errors=True)
+            lock.unlink(missing_ok=True)
+
+
+def move_into_place(staged: Path, target: Path) -> bool:
+    """Renames a synced folder to its final place; False where a folder that is not empty stands there."""
     try:
         os.rename(staged, target)
-    except OSError:
-        if target.is_dir():
+    except OSError as error:
+        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
             return False
         raise
     sync_folder(target.parent)
     return True
-
-
-@contextlib.contextmanager
-def stage(dataset: Path, unit: str) -> Iterator[Path]:
-    """A folder of this attempt under its own lock; removed at the end unless it was published."""
-    staging = dataset / STAGING
-    staging.mkdir(exist_ok=True)
-    attempt = staging / f"{unit}.{uuid.uuid4().hex}"
-    with lock_file(attempt.with_name(f"{attempt.name}.lock"), "this attempt") as lock:
-        attempt.mkdir()
-        try:
-            yield attempt
-        finally:
-            shutil.rmtree(attempt, ignore_errors=True)
-            lock.unlink(missing_ok=True)
 
 
 @contextlib.contextmanager

@@ -77,15 +77,17 @@ def unpack(arrays: Arrays) -> list[Trajectory]:
     ]
 
 
-def write_arrays(folder: Path, arrays: Arrays) -> None:
-    """Writes a part's arrays as a Zarr group into an empty folder.
+def encode_arrays(arrays: Arrays) -> dict[str, bytes]:
+    """The files of a part's Zarr group: relative path to content.
 
-    Every chunk is written, empty ones too: a missing chunk must never read as zeros.
+    Every chunk is there, empty ones too: a missing chunk must never read as zeros.
     """
     import zarr
     from zarr.codecs import BytesCodec, Crc32cCodec, ZstdCodec
+    from zarr.storage import MemoryStore
 
-    group = zarr.create_group(folder, zarr_format=3)
+    files: dict[str, Any] = {}
+    group = zarr.create_group(MemoryStore(files), zarr_format=3)
     for name, array in arrays.items():
         rows = max(1, len(array))
         row_bytes = max(1, array.nbytes // rows)
@@ -99,6 +101,7 @@ def write_arrays(folder: Path, arrays: Arrays) -> None:
             fill_value=np.nan if array.dtype.kind == "f" else array.dtype.type(0),
             config={"write_empty_chunks": True},
         )
+    return {name: buffer.to_bytes() for name, buffer in files.items()}
 
 
 def read_arrays(folder: Path, names: Iterable[str]) -> dict[str, npt.NDArray[Any]]:

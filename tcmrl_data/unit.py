@@ -28,12 +28,12 @@ from tcmrl_data.manifest import (
     part_folder,
     read_part_record,
 )
-from tcmrl_data.publish import publish_folder, stage, sync_tree, write_file
+from tcmrl_data.publish import publish_folder
 from tcmrl_data.recipe import Recipe
 from tcmrl_data.rollout import roll_out
 from tcmrl_data.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.snapshot import Snapshot
-from tcmrl_data.store import array_digests, pack, write_arrays
+from tcmrl_data.store import array_digests, encode_arrays, pack
 from tcmrl_data.tasks import Task
 from tcmrl_data.trajectory import Trajectory
 
@@ -142,19 +142,18 @@ class _TaskRoller:
                     f"{target}: its policy differs from the one trained now with the same seed"
                 )
             return record.id
-        with stage(dataset, f"task_{self.task.index:05d}") as staged:
-            part_id = self._write(staged, snapshot)
-            sync_tree(staged)
-            if not publish_folder(staged, target):
-                published = read_part_record(target / "part.json").id
-                if published != part_id:
-                    raise NondeterminismError(
-                        f"{target}: published with id {published}, made again with {part_id}"
-                    )
+        part_id, files = self._make(snapshot)
+        if not publish_folder(dataset, target, files, attempt=f"task_{self.task.index:05d}"):
+            published = read_part_record(target / "part.json").id
+            if published != part_id:
+                raise NondeterminismError(
+                    f"{target}: published with id {published}, made again with {part_id}"
+                )
         report({"kind": "part", "task": self.task.index, "step": snapshot.step, "id": part_id})
         return part_id
 
-    def _write(self, folder: Path, snapshot: Snapshot) -> str:
+    def _make(self, snapshot: Snapshot) -> tuple[str, dict[str, bytes]]:
+        """The id and all files of the snapshot's part."""
         environment, spec = self._environment, self._spec
         if self._lanes is None:
             self._lanes = environment.lanes(self._parameters)
@@ -162,9 +161,10 @@ class _TaskRoller:
         if self._references is None:
             self._references = self._measure_references()
         arrays = pack(trajectories)
-        write_arrays(folder, arrays)
-        for name, content in snapshot.files().items():
-            write_file(folder / name, content)
+        digests = {
+            name: ArrayRecord.model_validate_json(canonical_json(each))
+            for name, each in array_digests(arrays).items()
+        }
         identity = Identity(
             schema_version=SCHEMA_VERSION,
             data_version=DATA_VERSION,
@@ -174,22 +174,21 @@ class _TaskRoller:
             step=snapshot.step,
             seed=spec.seed,
             policy=snapshot.digest(),
-            arrays={
-                name: ArrayRecord.model_validate_json(canonical_json(each))
-                for name, each in array_digests(arrays).items()
-            },
+            arrays=digests,
         )
+        files = encode_arrays(arrays) | snapshot.files()
         record = PartRecord(
             schema_version=SCHEMA_VERSION,
             id=digest(identity.model_dump(mode="json")),
             identity=identity,
             statistics=statistics(trajectories),
             references=self._references,
-            files=file_records(folder),
+            files={
+                name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())
+            },
             provenance=provenance(environment),
         )
-        write_file(folder / "part.json", canonical_json(record.model_dump(mode="json")))
-        return record.id
+        return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}
 
     def _measure_references(self) -> References:
         """Uniform, oracle and noise-free scripted returns of the task, from one lane batch each."""
@@ -269,17 +268,6 @@ def statistics(trajectories: Sequence[Trajectory]) -> Statistics:
         success_rate=float(np.mean(success)) if success else None,
         moments=moments,
     )
-
-
-def file_records(folder: Path) -> dict[str, FileRecord]:
-    """Size and sha256 of every file below a folder."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return {
-        path.relative_to(folder).as_posix(): FileRecord(
-            size=path.stat().st_size, sha256=sha256(path.read_bytes())
-        )
-        for path in files
-    }
 
 
 def provenance(environment: Environment) -> dict[str, Any]:

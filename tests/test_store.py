@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from tcmrl_data import Dataset, Trajectory
 from tcmrl_data import store as store_module
 from tcmrl_data.errors import StoreError
-from tcmrl_data.store import array_files, pack, read_arrays, unpack, write_arrays
+from tcmrl_data.publish import write_tree
+from tcmrl_data.store import array_files, encode_arrays, pack, read_arrays, unpack
 from tests.strategies import trajectories
 
 
@@ -29,7 +30,7 @@ def test_episodes_survive_disk_at_any_chunk_size(
     folder = tmp_path_factory.mktemp("part") / "part"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store_module, "CHUNK_BYTES", chunk_bytes)
-        write_arrays(folder, pack(episodes))
+        write_tree(folder, encode_arrays(pack(episodes)))
     back = unpack(read_arrays(folder, pack(episodes)))
     assert len(back) == len(episodes)
     assert all(same(*pair) for pair in zip(back, episodes, strict=True))
@@ -46,7 +47,7 @@ def test_observations_hold_one_row_more_per_episode() -> None:
 def test_a_missing_chunk_is_an_error_not_zeros(tmp_path: Path) -> None:
     flags = np.zeros(3, dtype=bool)
     episode = Trajectory(np.ones((4, 2)), np.ones((3, 1)), np.ones(3), flags, flags)
-    write_arrays(tmp_path / "part", pack([episode]))
+    write_tree(tmp_path / "part", encode_arrays(pack([episode])))
     (tmp_path / "part" / "terminated" / "c" / "0").unlink()
     with pytest.raises(StoreError, match="terminated/c/0 is missing"):
         read_arrays(tmp_path / "part", ["terminated"])
@@ -77,7 +78,7 @@ def test_tensorstore_reads_the_same_bytes(tiny: Dataset) -> None:
     ],
 )
 def test_metadata_outside_the_allow_list_is_refused(tmp_path: Path, field: str, value: object) -> None:
-    write_arrays(tmp_path / "part", {"actions": np.ones((3, 2), dtype=np.float32)})
+    write_tree(tmp_path / "part", encode_arrays({"actions": np.ones((3, 2), dtype=np.float32)}))
     assert array_files(tmp_path / "part", "actions") == ["actions/zarr.json", "actions/c/0/0"]
     file = tmp_path / "part" / "actions" / "zarr.json"
     file.write_text(json.dumps(json.loads(file.read_text()) | {field: value}))

@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset import Dataset, Selection
 from tcmrl_data.errors import StoreError
-from tcmrl_data.publish import publish_folder, sync_tree
+from tcmrl_data.publish import move_into_place, sync_tree
 from tcmrl_data.tasks import Task
 from tcmrl_data.trajectory import Trajectory
 
@@ -75,7 +75,7 @@ def export(
                 done += 1
                 progress(done, total)
         sync_tree(staged)
-        if not publish_folder(staged, out):
+        if not move_into_place(staged, out):
             raise StoreError(f"--out {out} appeared meanwhile; choose another folder or remove it")
     finally:
         shutil.rmtree(staged, ignore_errors=True)
