@@ -24,7 +24,15 @@ from tcmrl_data.manifest import (
     read_part_record,
     seal,
 )
-from tcmrl_data.publish import LOCK, STAGING, lock_file, remove_abandoned, replace_file, write_file
+from tcmrl_data.publish import (
+    CHECKPOINTS,
+    LOCK,
+    STAGING,
+    lock_file,
+    remove_abandoned,
+    replace_file,
+    write_file,
+)
 from tcmrl_data.recipe import Recipe
 from tcmrl_data.store import GROUP, check_layout
 from tcmrl_data.tasks import Task, choose_tasks
@@ -33,7 +41,7 @@ from tcmrl_data.unit import UnitSpec, behavior_source
 MANIFEST_SECONDS = 1.0
 """The manifest is rewritten at most this often while parts arrive, and at the end."""
 
-OWN_FILES = {MANIFEST, LOCK, STAGING, "zarr.json", "tasks"}
+OWN_FILES = {MANIFEST, LOCK, STAGING, CHECKPOINTS, "zarr.json", "tasks"}
 
 
 @dataclass(frozen=True)
@@ -205,7 +213,7 @@ class _Driver:
         }
         data, file = seal(fields), self._out / MANIFEST
         if not file.is_file() or file.read_bytes() != data:
-            replace_file(self._out, MANIFEST, data)
+            replace_file(self._out, MANIFEST, data, staging=self._out / STAGING)
         self._written = time.monotonic()
         return str(fields["root"])
 

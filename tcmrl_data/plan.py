@@ -1,12 +1,15 @@
 """What a build will take: tasks, parts, environment steps, bytes, and a time measured by a short probe."""
 
+import contextlib
 import math
 import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from tcmrl_data.behavior import BehaviorContext
+from tcmrl_data.checkpoints import CheckpointFolder
 from tcmrl_data.environment import Environment, UniformController
 from tcmrl_data.recipe import Recipe
 from tcmrl_data.rollout import roll_out
@@ -103,12 +106,11 @@ def _training_seconds_per_step(recipe: Recipe, environment: Environment, task: T
         observation=recipe.behavior["observation"],
         reward=recipe.behavior["reward"],
         report=report,
+        checkpoints=lambda task: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
     )
-    try:
+    with contextlib.suppress(_ProbeOverError):
         for _ in behavior_source(recipe).snapshots(context):
             pass
-    except _ProbeOverError:
-        pass
     late = [mark for mark in marks if mark[0] > started + PROBE_SECONDS / 2] or marks
     if len(late) < 2:
         return 0.0 if not marks else (marks[-1][0] - started) / sum(count for _, count in marks)

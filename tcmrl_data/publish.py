@@ -13,6 +13,7 @@ from tcmrl_data.errors import LockedError
 
 STAGING = ".staging"
 LOCK = ".lock"
+CHECKPOINTS = ".checkpoints"
 
 
 def write_file(path: Path, data: bytes) -> None:
@@ -56,14 +57,19 @@ def sync_tree(folder: Path) -> None:
     sync_folder(folder)
 
 
-def replace_file(dataset: Path, name: str, data: bytes) -> None:
-    """Puts `data` under dataset/name in one step: readers see the old file or the new one."""
-    staging = dataset / STAGING
+def replace_file(folder: Path, name: str, data: bytes, *, staging: Path) -> None:
+    """Puts `data` under folder/name in one step: readers see the old file or the new one."""
     staging.mkdir(exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     temporary = staging / f"{name}.{uuid.uuid4().hex}"
     write_file(temporary, data)
-    os.replace(temporary, dataset / name)
-    sync_folder(dataset)
+    os.replace(temporary, folder / name)
+    sync_folder(folder)
+
+
+def remove_tree(folder: Path) -> None:
+    """Removes a folder and all it holds, if it is there."""
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 def publish_folder(dataset: Path, target: Path, files: Mapping[str, bytes], *, attempt: str) -> bool:

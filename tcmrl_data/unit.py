@@ -1,6 +1,8 @@
 """What one worker does: train a unit's behavior policies, roll them out, publish each part. Idempotent."""
 
+import contextlib
 import datetime
+import math
 import platform
 import socket
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,6 +15,7 @@ import numpy as np
 
 from tcmrl_data.behavior import BehaviorContext, BehaviorSource
 from tcmrl_data.canonical import canonical_json, digest, sha256
+from tcmrl_data.checkpoints import CheckpointFolder
 from tcmrl_data.discovery import plugin
 from tcmrl_data.environment import Controller, Environment, Lanes, UniformController
 from tcmrl_data.errors import NondeterminismError
@@ -95,6 +98,18 @@ def run_unit(spec: UnitSpec, report: Report) -> str:
     Raises:
         NondeterminismError: a published part of the same task and step has another id.
     """
+    source = behavior_source(spec.recipe)
+    folders = {
+        (task.index, step): spec.dataset / part_folder(task.index, step)
+        for task in spec.tasks
+        for step in source.steps
+    }
+    if not all((folder / "part.json").is_file() for folder in folders.values()):
+        _make_parts(spec, source, report)
+    return digest([read_part_record(folder / "part.json").id for folder in folders.values()])
+
+
+def _make_parts(spec: UnitSpec, source: BehaviorSource, report: Report) -> None:
     environment = spec.recipe.make_environment()
     context = BehaviorContext(
         environment=environment,
@@ -103,18 +118,37 @@ def run_unit(spec: UnitSpec, report: Report) -> str:
         observation=spec.recipe.behavior["observation"],
         reward=spec.recipe.behavior["reward"],
         report=lambda count: report({"kind": "steps", "count": count}),
+        checkpoints=lambda task: _checkpoints(spec, source, task),
     )
-    ids = []
-    roller: _TaskRoller | None = None
-    for task, snapshot in behavior_source(spec.recipe).snapshots(context):
-        if roller is None or roller.task != task:
-            if roller is not None:
-                roller.close()
-            roller = _TaskRoller(spec, environment, task)
-        ids.append(roller.publish(snapshot, report))
-    if roller is not None:
-        roller.close()
-    return digest(ids)
+    with contextlib.ExitStack() as stack:
+        rollers: dict[int, _TaskRoller] = {}
+        for task, snapshot in source.snapshots(context):
+            if task.index not in rollers:
+                rollers[task.index] = _TaskRoller(spec, environment, task)
+                stack.callback(rollers[task.index].close)
+            rollers[task.index].publish(snapshot, report)
+            if snapshot.step == source.steps[-1]:
+                rollers[task.index].close()
+                _checkpoints(spec, source, task).clear()
+
+
+def _checkpoints(spec: UnitSpec, source: BehaviorSource, task: Task) -> CheckpointFolder:
+    """Where the task's training keeps its state; bound to everything that the training depends on."""
+    key = {
+        "data_version": DATA_VERSION,
+        "settings": spec.recipe.unit_settings(),
+        "seed": spec.seed,
+        "task": task.index,
+        "packages": {name: version(name) for name in PACKAGES},
+    }
+    missing = [
+        step
+        for step in source.steps
+        if not (spec.dataset / part_folder(task.index, step) / "part.json").is_file()
+    ]
+    return CheckpointFolder(
+        spec.dataset, f"task_{task.index:05d}", key=digest(key), before=min(missing, default=math.inf)
+    )
 
 
 class _TaskRoller:
@@ -128,8 +162,10 @@ class _TaskRoller:
         self._references: References | None = None
 
     def close(self) -> None:
+        """Frees the lanes; closing twice does no harm."""
         if self._lanes is not None:
             self._lanes.close()
+            self._lanes = None
 
     def publish(self, snapshot: Snapshot, report: Report) -> str:
         """Publishes the part of a snapshot and returns its id."""

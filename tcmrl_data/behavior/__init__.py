@@ -4,6 +4,7 @@ import abc
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
+from tcmrl_data.checkpoints import CheckpointFolder
 from tcmrl_data.environment import Environment, Reward, View
 from tcmrl_data.snapshot import Snapshot
 from tcmrl_data.tasks import Task
@@ -20,6 +21,7 @@ class BehaviorContext:
         observation: view that the policies see.
         reward: reward that the policies learn from.
         report: called with the number of environment steps done since the last call.
+        checkpoints: where the training of a task keeps its state.
     """
 
     environment: Environment
@@ -28,6 +30,7 @@ class BehaviorContext:
     observation: View
     reward: Reward
     report: Callable[[int], None]
+    checkpoints: Callable[[Task], CheckpointFolder]
 
 
 class BehaviorSource(abc.ABC):

@@ -1,19 +1,23 @@
 """One Stable-Baselines3 SAC per task: its own replay buffer, entropy coefficient and seed."""
 
 from collections.abc import Iterator
-from itertools import pairwise
-from typing import Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal, SupportsFloat, final
 
 import gymnasium
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.behavior import BehaviorContext, BehaviorSource
+from tcmrl_data.behavior._sac_state import capture, restore
 from tcmrl_data.seeding import Purpose, keyed_seed
 from tcmrl_data.snapshot import Snapshot, snapshot_of_sac
 from tcmrl_data.tasks import Task
 
+if TYPE_CHECKING:
+    from stable_baselines3 import SAC
+
 NAME = "sac"
 REPORT_EVERY = 100
+"""Updates between two reports of progress."""
 
 
 class Settings(BaseModel):
@@ -76,52 +80,83 @@ class Source(BehaviorSource):
             yield from ((task, snapshot) for snapshot in self._train(context, task))
 
     def _train(self, context: BehaviorContext, task: Task) -> Iterator[Snapshot]:
-        from stable_baselines3 import SAC
-        from stable_baselines3.common.callbacks import ConvertCallback
+        """Trains in chunks; between two of them, at an episode's border, the state may be kept.
 
-        settings = self._settings
-        model = SAC(
-            "MlpPolicy",
-            KeyedResets(context, task),
-            learning_rate=settings.learning_rate,
-            buffer_size=min(settings.buffer_size, settings.steps),
-            learning_starts=settings.warmup,
-            batch_size=settings.batch_size,
-            tau=settings.tau,
-            gamma=settings.gamma,
-            train_freq=settings.train_frequency,
-            gradient_steps=settings.gradient_steps,
-            ent_coef=settings.entropy,
-            policy_kwargs={"net_arch": list(settings.hidden)},
-            seed=keyed_seed(context.seed, context.environment.name, task.index, Purpose.BEHAVIOR),
-            device="cpu",
-        )
+        SB3's `learn` called in chunks does what one call does, so neither chunks nor checkpoints change
+        a result.
+        """
+        settings, checkpoints = self._settings, context.checkpoints(task)
+        episodes = KeyedResets(context, task)
+        seed = keyed_seed(context.seed, context.environment.name, task.index, Purpose.BEHAVIOR)
+        model = make_model(settings, episodes, seed=seed)
+        steps_done = -1
+        checkpoint = checkpoints.load()
+        if checkpoint is not None:
+            steps_done = restore(model, episodes, checkpoint)
+            context.report(steps_done)
+        for step in settings.snapshots:
+            while model.num_timesteps < step:
+                chunk = min(REPORT_EVERY * settings.train_frequency, step - model.num_timesteps)
+                if checkpoints.is_due():
+                    if episodes.at_border:
+                        checkpoints.save(capture(model, episodes))
+                    else:
+                        chunk = settings.train_frequency
+                model.learn(chunk, reset_num_timesteps=False)
+                context.report(chunk)
+            if step > steps_done:
+                yield snapshot_of_sac(model, step=step, observation=context.observation)
 
-        def count(values: dict[str, Any], _: dict[str, Any]) -> bool:
-            if values["self"].num_timesteps % REPORT_EVERY == 0:
-                context.report(REPORT_EVERY)
-            return True
 
-        yield snapshot_of_sac(model, step=0, observation=context.observation)
-        for done, step in pairwise(settings.snapshots):
-            model.learn(step - done, callback=ConvertCallback(count), reset_num_timesteps=False)
-            yield snapshot_of_sac(model, step=step, observation=context.observation)
+def make_model(settings: Settings, environment: gymnasium.Env[Any, Any], *, seed: int) -> "SAC":
+    """An untrained SAC; seeds the global generators of Python, NumPy and torch, as SB3 does."""
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.logger import Logger
+
+    model = SAC(
+        "MlpPolicy",
+        environment,
+        learning_rate=settings.learning_rate,
+        buffer_size=min(settings.buffer_size, settings.steps),
+        learning_starts=settings.warmup,
+        batch_size=settings.batch_size,
+        tau=settings.tau,
+        gamma=settings.gamma,
+        train_freq=settings.train_frequency,
+        gradient_steps=settings.gradient_steps,
+        ent_coef=settings.entropy,
+        policy_kwargs={"net_arch": list(settings.hidden)},
+        seed=seed,
+        device="cpu",
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    return model
 
 
 @final
 class KeyedResets(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Resets the n-th training episode with its own keyed seed, so that episodes never depend on history."""
+    """Resets the n-th training episode with its own keyed seed, so that episodes never depend on history.
+
+    Attributes:
+        episode: number of the running episode; -1 before the first.
+        at_border: the running episode has no step yet.
+    """
 
     def __init__(self, context: BehaviorContext, task: Task) -> None:
         super().__init__(
             context.environment.make(task.parameters, view=context.observation, reward=context.reward)
         )
         self._key = (context.seed, context.environment.name, task.index, Purpose.BEHAVIOR_RESET)
-        self._episode = 0
+        self.episode = -1
+        self.at_border = False
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        keyed = keyed_seed(*self._key, self._episode)
-        self._episode += 1
-        return super().reset(seed=keyed, options=options)
+        self.episode += 1
+        self.at_border = True
+        return super().reset(seed=keyed_seed(*self._key, self.episode), options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        self.at_border = False
+        return super().step(action)
