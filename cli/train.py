@@ -273,8 +273,8 @@ def _print_table(results: Sequence["Evaluation"]) -> None:
     with_success = any(task.success is not None for each in results for task in each.tasks)
     columns = ["task", "uniform", "oracle"]
     for each in results:
-        columns += [f"{each.protocol} {what}" for what in ("adapted", "other", "regret")]
-        columns += [f"{each.protocol} success"] if with_success else []
+        columns += [f"{each.protocol}\n{what}" for what in ("adapted", "other", "regret")]
+        columns += [f"{each.protocol}\nsuccess"] if with_success else []
     title = f"{first.algorithm} on {first.environment}, seed {first.seed}: returns on the test tasks"
     table = make_table(title, columns=columns, text=("task",))
     rows = []

@@ -4,7 +4,7 @@ import json
 from collections.abc import Mapping
 from pathlib import Path
 from types import TracebackType
-from typing import Self, final
+from typing import final
 
 from torch.utils.tensorboard import SummaryWriter
 
@@ -31,7 +31,7 @@ class MetricsWriter:
         for name, value in metrics.items():
             self._board.add_scalar(name, value, step)
 
-    def __enter__(self) -> Self:
+    def __enter__(self) -> "MetricsWriter":
         return self
 
     def __exit__(

@@ -3,7 +3,7 @@
 import abc
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Self, final
+from typing import Any, Literal, final
 
 import numpy as np
 import torch
@@ -86,7 +86,7 @@ class MomentsRecord(BaseModel):
     reward_max: float
 
     @classmethod
-    def of(cls, moments: Moments) -> Self:
+    def of(cls, moments: Moments) -> "MomentsRecord":
         """The record of a sampler's statistics."""
         values = {name: getattr(moments, name) for name in cls.model_fields}
         return cls.model_validate(

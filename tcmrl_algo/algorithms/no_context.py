@@ -1,4 +1,10 @@
-"""The control: TCMRL's actor-critic trained on the same tasks, blind to which task it is in."""
+"""The control: TCMRL's actor-critic trained on the same tasks, blind to which task it is in.
+
+Expect it to do worse than the best policy that ignores the task, at times worse than uniform actions. The
+behavior data confound state and task: near a goal it comes from the agents that were paid for going there,
+so that a blind critic believes every goal to pay well, and the policy leaves for one of them or beyond.
+With rewards averaged over the training tasks the same training ends at the best fixed target.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import final

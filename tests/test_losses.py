@@ -1,0 +1,252 @@
+"""Losses against numbers worked out by hand, one double-precision gradient check each."""
+
+import math
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor
+
+from tcmrl_algo import losses
+
+YES = torch.tensor([[True, True]])
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
+
+
+MASK = torch.tensor([[True, True, True], [True, True, False]])
+FULL = torch.ones(2, 3, dtype=torch.bool)
+NOISE = random(2, 3, seed=9).detach()
+DIFFERENTIABLE: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
+    "masked_mean": (lambda x: losses.masked_mean(x, MASK), (random(2, 3),)),
+    "sparsity": (lambda x: losses.sparsity_loss(x, MASK), (random(2, 3),)),
+    "literal_sparsity": (lambda x: losses.literal_sparsity_loss(x.square() + 0.1, MASK), (random(2, 3),)),
+    "reverse_context": (
+        lambda c, w: losses.reverse_context(c, w, MASK).square().sum(),
+        (random(2, 3, 4), random(2, 3, seed=1)),
+    ),
+    "negative_rewards": (
+        lambda r: losses.negative_rewards(r, MASK, kind="random", noise=NOISE).square().sum(),
+        (random(2, 3),),
+    ),
+    "positive_reward": (
+        lambda p, r: losses.positive_reward_loss(p, r, MASK),
+        (random(2, 3), random(2, 3, seed=1)),
+    ),
+    "negative_reward": (
+        lambda p, r: losses.negative_reward_loss(p, r, MASK),
+        (random(2, 3), random(2, 3, seed=1)),
+    ),
+    "positive_return": (
+        lambda p, r: losses.positive_return_loss(p, r, MASK),
+        (random(2), random(2, 3, seed=1)),
+    ),
+    "negative_return": (
+        lambda p, r: losses.negative_return_loss(p, r, MASK),
+        (random(2), random(2, 3, seed=1)),
+    ),
+    "info_nce": (
+        lambda q, k: losses.info_nce(q, k, MASK.T, temperature=0.7),
+        (random(3, 2, 4), random(3, 2, 4, seed=1)),
+    ),
+    "task_contrastive": (
+        lambda c, w: losses.task_contrastive_loss(c, FULL.unsqueeze(1), w, window_length=2),
+        (random(2, 1, 3, 4), random(4, 4, seed=1)),
+    ),
+    "distance_metric": (
+        lambda c: losses.distance_metric_loss(c, torch.tensor([0, 0, 1])),
+        (random(3, 4),),
+    ),
+    "orthogonality": (losses.orthogonality_loss, (random(2, 3),)),
+    "q": (
+        lambda q: losses.q_loss(q, NOISE[0], torch.zeros(3).double(), NOISE[1], gamma=0.9),
+        (random(2, 3),),
+    ),
+    "value": (lambda v: losses.value_loss(v, NOISE[0]), (random(3),)),
+    "policy": (lambda p, q: losses.policy_loss(p, q, entropy=0.3), (random(3), random(3, seed=1))),
+    "dual_divergence": (losses.dual_divergence, (random(3), random(3, seed=1))),
+    "gradient_penalty": (lambda g: losses.gradient_penalty(2.0 * g), (random(3, 4),)),
+}
+
+
+@pytest.mark.parametrize("name", DIFFERENTIABLE)
+def test_gradients_are_right(name: str) -> None:
+    function, inputs = DIFFERENTIABLE[name]
+    assert torch.autograd.gradcheck(function, inputs)
+
+
+def test_masked_mean_leaves_padding_out() -> None:
+    values = torch.tensor([[1.0, 2.0, torch.nan]])
+    assert losses.masked_mean(values, torch.tensor([[True, True, False]])).item() == 1.5
+    assert losses.masked_mean(values, torch.zeros(1, 3, dtype=torch.bool)).item() == 0.0
+
+
+def test_sparsity_is_the_mean_sigmoid_of_real_scores() -> None:
+    scores = torch.tensor([[0.0, math.log(3.0), 50.0]])  # sigmoid: 1/2, 3/4, (padding)
+    mask = torch.tensor([[True, True, False]])
+    assert losses.sparsity_loss(scores, mask).item() == pytest.approx(0.625)
+
+
+def test_literal_equation_6_is_one_with_zero_gradient_where_ours_has_one() -> None:
+    scores = random(2, 3)
+    masked = torch.where(MASK, scores, -torch.inf)
+    literal = losses.literal_sparsity_loss(torch.softmax(masked, dim=-1), MASK)
+    assert literal.item() == pytest.approx(1.0)
+    (gradient,) = torch.autograd.grad(literal, scores)
+    assert gradient.abs().max() < 1e-15
+    (gradient,) = torch.autograd.grad(losses.sparsity_loss(scores, MASK), scores)
+    assert gradient[MASK].min() > 0.01
+
+
+def test_reverse_context_weighs_by_one_minus_attention() -> None:
+    representations = torch.tensor([[[1.0, 0.0], [0.0, 1.0], [2.0, 2.0], [9.0, 9.0]]])
+    weights = torch.tensor([[0.5, 0.25, 0.25, 0.0]])
+    mask = torch.tensor([[True, True, True, False]])
+    literal = losses.reverse_context(representations, weights, mask, literal=True)
+    torch.testing.assert_close(literal, torch.tensor([[2.0, 2.25]]))  # .5(1,0) + .75(0,1) + .75(2,2)
+    divided = losses.reverse_context(representations, weights, mask)
+    torch.testing.assert_close(divided, torch.tensor([[1.0, 1.125]]))  # T - 1 = 2
+
+
+def test_reverse_context_of_a_single_step_is_zero() -> None:
+    result = losses.reverse_context(torch.ones(1, 1, 2), torch.ones(1, 1), torch.ones(1, 1, dtype=torch.bool))
+    torch.testing.assert_close(result, torch.zeros(1, 2))
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [("random", [1.5, 3.0, -1.0]), ("max", [3.0, 3.0, 3.0]), ("min", [1.0, 1.0, 1.0])],
+)
+def test_negative_rewards(kind: losses.NegativeKind, expected: list[float]) -> None:
+    rewards, mask = torch.tensor([[1.0, 3.0, -7.0]]), torch.tensor([[True, True, False]])
+    noise = torch.tensor([[0.5, 0.0, 6.0]])
+    result = losses.negative_rewards(rewards, mask, kind=kind, noise=noise)
+    torch.testing.assert_close(result, torch.tensor([expected]))
+
+
+@pytest.mark.parametrize("loss", [losses.positive_reward_loss, losses.negative_reward_loss])
+def test_reward_losses_are_mean_squared_errors_of_real_steps(loss: Callable[..., Tensor]) -> None:
+    predicted, target = torch.tensor([[1.0, 2.0, 9.0]]), torch.tensor([[0.0, 4.0, 0.0]])
+    assert loss(predicted, target, torch.tensor([[True, True, False]])).item() == 2.5  # (1 + 4) / 2
+
+
+@pytest.mark.parametrize("loss", [losses.positive_return_loss, losses.negative_return_loss])
+def test_return_losses_compare_with_the_sum_of_real_rewards(loss: Callable[..., Tensor]) -> None:
+    rewards = torch.tensor([[1.0, 2.0, 9.0], [1.0, 1.0, 1.0]])
+    mask = torch.tensor([[True, True, False], [True, True, True]])
+    assert loss(torch.tensor([5.0, 3.0]), rewards, mask).item() == 2.0  # ((5-3)^2 + (3-3)^2) / 2
+
+
+def test_info_nce_of_two_tasks() -> None:
+    queries = torch.tensor([[1.0, 0.0], [0.0, 1.0]])
+    keys = torch.tensor([[2.0, 0.0], [0.0, 4.0]])
+    both = torch.tensor([True, True])
+    expected = (math.log(1 + math.exp(-2)) + math.log(1 + math.exp(-4))) / 2
+    assert losses.info_nce(queries, keys, both).item() == pytest.approx(expected, rel=1e-6)
+    expected = (math.log(1 + math.exp(-1)) + math.log(1 + math.exp(-2))) / 2
+    assert losses.info_nce(queries, keys, both, temperature=2.0).item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_info_nce_knows_only_present_tasks() -> None:
+    queries, keys = random(2, 3, 4).detach(), random(2, 3, 4, seed=1).detach()
+    mask = torch.tensor([[True, True, False], [True, False, False]])  # at position 1, task 0 is alone
+    pair = losses.info_nce(queries[:1, :2], keys[:1, :2], mask[:1, :2])
+    torch.testing.assert_close(losses.info_nce(queries, keys, mask), pair)
+
+
+def test_task_contrastive_loss_by_hand() -> None:
+    """Two tasks, T = 3, K = 2, latent 1, W = 2: at t the prior is c_t and the target c_{t+1}."""
+    first, second = [1.0, 2.0, 0.0], [0.0, -1.0, 3.0]
+    representations = torch.tensor([first, second]).view(2, 1, 3, 1)
+    mask = torch.ones(2, 1, 3, dtype=torch.bool)
+    loss = losses.task_contrastive_loss(representations, mask, torch.tensor([[2.0]]), window_length=2)
+    terms = []
+    for t in range(2):
+        for own, prior in enumerate((first[t], second[t])):
+            logits = [2.0 * prior * target for target in (first[t + 1], second[t + 1])]
+            terms.append(logits[own] - math.log(sum(math.exp(each) for each in logits)))
+    assert loss.item() == pytest.approx(-sum(terms) / 4, rel=1e-6)
+
+
+def test_prior_is_the_mean_of_all_but_the_last_representation() -> None:
+    representations = random(2, 1, 3, 4).detach()
+    mask = torch.ones(2, 1, 3, dtype=torch.bool)
+    similarity = random(4, 4, seed=1).detach()
+    loss = losses.task_contrastive_loss(representations, mask, similarity, window_length=3)
+    prior = (representations[:, 0, 0] + representations[:, 0, 1]) / 2
+    logits = prior @ similarity @ representations[:, 0, 2].T
+    torch.testing.assert_close(loss, -torch.log_softmax(logits, dim=-1).diagonal().mean())
+
+
+def test_contrastive_padding_neither_counts_nor_competes() -> None:
+    representations, similarity = random(3, 2, 5, 4).detach(), torch.eye(4, dtype=torch.float64)
+    mask = torch.ones(3, 2, 5, dtype=torch.bool)
+    mask[2, :, 2:] = False
+    loss = losses.task_contrastive_loss(representations, mask, similarity, window_length=2)
+    changed = torch.where(mask.unsqueeze(-1), representations, 77.0)
+    again = losses.task_contrastive_loss(changed, mask, similarity, window_length=2)
+    torch.testing.assert_close(loss, again)
+    longer = torch.cat([changed, changed[:, :, :2]], dim=2)
+    padded = torch.cat([mask, torch.zeros(3, 2, 2, dtype=torch.bool)], dim=2)
+    torch.testing.assert_close(
+        loss, losses.task_contrastive_loss(longer, padded, similarity, window_length=2)
+    )
+
+
+def test_contrastive_loss_of_episodes_shorter_than_a_window_is_zero() -> None:
+    mask = torch.ones(2, 1, 3, dtype=torch.bool)
+    loss = losses.task_contrastive_loss(random(2, 1, 3, 4), mask, random(4, 4), window_length=5)
+    assert loss.item() == 0.0
+    loss.backward()  # still part of the graph
+
+
+def test_distance_metric_by_hand() -> None:
+    contexts = torch.tensor([[0.0, 0.0], [2.0, 0.0], [0.0, 4.0]])
+    loss = losses.distance_metric_loss(contexts, torch.tensor([0, 0, 1]), epsilon=0.5)
+    expected = 2.0 + (1 / 8.5 + 1 / 10.5) / 2  # d^2 is 4/2 within; 16/2 and 20/2 between
+    assert loss.item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_orthogonality_by_hand() -> None:
+    weights = torch.tensor([[0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [1.0, 0.0, 0.0]])
+    assert losses.orthogonality_loss(weights).item() == pytest.approx(0.25)  # pairs: 1/4, 1/2, 0
+    assert losses.orthogonality_loss(weights[:1]).item() == 0.0
+
+
+def test_q_loss_by_hand() -> None:
+    q_values = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
+    loss = losses.q_loss(
+        q_values, torch.tensor([1.0, 3.0]), torch.tensor([0.0, 1.0]), torch.tensor([2.0, 100.0]), gamma=0.5
+    )
+    assert loss.item() == 3.0  # targets 2 and 3: (1 + 1) / 2 + (4 + 0) / 2
+
+
+def test_targets_get_no_gradient() -> None:
+    bootstrap, target = random(3), random(3, seed=1)
+    zeros = torch.zeros(3, dtype=torch.float64)
+    losses.q_loss(random(2, 3), zeros, zeros, bootstrap, gamma=0.9).backward()
+    losses.value_loss(random(3), target).backward()
+    assert bootstrap.grad is None
+    assert target.grad is None
+
+
+def test_value_and_policy_loss_by_hand() -> None:
+    assert losses.value_loss(torch.tensor([1.0, 3.0]), torch.tensor([2.0, 1.0])).item() == 2.5
+    loss = losses.policy_loss(torch.tensor([1.0, 3.0]), torch.tensor([4.0, 2.0]), entropy=0.5)
+    assert loss.item() == -2.0  # ((0.5 - 4) + (1.5 - 2)) / 2
+
+
+def test_dual_divergence_is_zero_where_the_estimated_ratio_is_one() -> None:
+    one = torch.full((5,), math.log(math.e - 1.0), dtype=torch.float64)  # softplus gives 1
+    assert losses.dual_divergence(one, one).item() == pytest.approx(0.0, abs=1e-12)
+    two = torch.full((5,), math.log(math.e**2 - 1.0), dtype=torch.float64)
+    assert losses.dual_divergence(one, two).item() == pytest.approx(math.log(2.0))
+    assert torch.isfinite(losses.dual_divergence(one, torch.full((5,), -1e4, dtype=torch.float64)))
+
+
+def test_gradient_penalty_starts_above_norm_one() -> None:
+    gradients = torch.tensor([[3.0, 4.0], [0.3, 0.4]])
+    assert losses.gradient_penalty(gradients).item() == pytest.approx(8.0)  # ((5 - 1)^2 + 0) / 2

@@ -1,0 +1,178 @@
+"""Networks: attention, masks, frozen calls, starts, and the squashed policy."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+
+from tcmrl_algo.networks import (
+    LARGEST_INPUT,
+    ContextEncoder,
+    Perceptron,
+    PerceptronEnsemble,
+    Standardizer,
+    TaskExtractor,
+    TrajectoryRewardEstimator,
+    TransitionRewardEstimator,
+    call_frozen,
+)
+from tcmrl_algo.policy import GaussianPolicy
+
+
+def generator(seed: int = 0) -> torch.Generator:
+    return torch.Generator().manual_seed(seed)
+
+
+def random(*shape: int, seed: int = 1) -> Tensor:
+    return torch.randn(*shape, generator=generator(seed))
+
+
+def extractor(hidden: tuple[int, ...] = (8,)) -> TaskExtractor:
+    return TaskExtractor(4, hidden=hidden, generator=generator())
+
+
+MASK = torch.tensor([[True, True, True, False], [True, False, False, False]])
+
+
+@pytest.mark.parametrize("hidden", [(8,), ()])
+def test_attention_follows_equations_2_to_5(hidden: tuple[int, ...]) -> None:
+    representations, network = random(1, 3, 4), extractor(hidden)
+    attention = network(representations, torch.ones(1, 3, dtype=torch.bool))
+    mean = representations[0].mean(dim=0)
+    scores = torch.stack([network.perceptron(torch.cat([each, mean])) for each in representations[0]])
+    weights = torch.softmax(scores.flatten(), dim=0)
+    torch.testing.assert_close(attention.weights[0], weights)
+    torch.testing.assert_close(attention.context[0], weights @ representations[0])
+
+
+def test_attention_weights_sum_to_one_over_real_steps() -> None:
+    attention = extractor()(random(2, 4, 4), MASK)
+    torch.testing.assert_close(attention.weights.sum(dim=-1), torch.ones(2))
+    assert (attention.weights[~MASK] == 0).all()
+    assert (attention.weights[MASK] > 0).all()
+
+
+def test_padding_changes_no_context() -> None:
+    representations = random(2, 4, 4)
+    attention = extractor()(representations, MASK)
+    garbage = torch.where(MASK.unsqueeze(-1), representations, torch.tensor(torch.nan))
+    torch.testing.assert_close(extractor()(garbage, MASK).context, attention.context)
+    short = extractor()(representations[:1, :3], MASK[:1, :3])
+    torch.testing.assert_close(short.context, attention.context[:1])
+
+
+def test_order_of_transitions_changes_no_context() -> None:
+    representations, order = random(1, 5, 4), torch.tensor([3, 0, 4, 1, 2])
+    mask = torch.ones(1, 5, dtype=torch.bool)
+    first, second = extractor()(representations, mask), extractor()(representations[:, order], mask)
+    torch.testing.assert_close(first.context, second.context)
+    torch.testing.assert_close(first.weights[:, order], second.weights)
+
+
+def test_encoder_reads_every_part_of_a_transition() -> None:
+    encoder = ContextEncoder(3, 2, latent=5, hidden=(16,), generator=generator())
+    inputs = [random(6, 3), random(6, 2), random(6), random(6, 3, seed=2)]
+    start = encoder(*inputs)
+    assert start.shape == (6, 5)
+    assert start.abs().max() < 1
+    for place in range(4):
+        changed = [each + (1.0 if index == place else 0.0) for index, each in enumerate(inputs)]
+        assert not torch.allclose(encoder(*changed), start)
+
+
+def test_transition_estimator_gives_each_task_its_own_context() -> None:
+    estimator = TransitionRewardEstimator(3, 2, latent=4, hidden=(16,), generator=generator())
+    observations, actions, context = random(2, 1, 5, 3), random(2, 1, 5, 2), random(2, 4)
+    mask = torch.ones(2, 1, 5, dtype=torch.bool)
+    together = estimator(observations, actions, mask, context)
+    alone = estimator(observations[1:], actions[1:], mask[1:], context[1:])
+    torch.testing.assert_close(together[1:], alone)
+    swapped = estimator(observations, actions, mask, context.flip(0))
+    assert not torch.allclose(swapped, together)
+
+
+def test_trajectory_estimator_ignores_padding_and_its_length() -> None:
+    estimator = TrajectoryRewardEstimator(3, 2, latent=4, horizon=7, hidden=(16,), generator=generator())
+    observations, actions, context = random(2, 1, 5, 3), random(2, 1, 5, 2), random(2, 4)
+    mask = torch.tensor([[[True] * 5], [[True] * 3 + [False] * 2]])
+    returns = estimator(observations, actions, mask, context)
+    assert returns.shape == (2, 1)
+    changed = torch.where(mask.unsqueeze(-1), observations, 9.0)
+    torch.testing.assert_close(estimator(changed, actions, mask, context), returns)
+    short = estimator(observations[1:, :, :3], actions[1:, :, :3], mask[1:, :, :3], context[1:])
+    torch.testing.assert_close(short, returns[1:])
+    moved = estimator(observations + 1.0, actions, mask, context)
+    assert not torch.allclose(moved, returns)
+
+
+def test_frozen_call_passes_gradients_to_inputs_alone() -> None:
+    network, inputs = Perceptron((3, 4, 1), generator=generator()), random(5, 3).requires_grad_()
+    output = call_frozen(network, inputs)
+    torch.testing.assert_close(output, network(inputs))
+    output.sum().backward()
+    assert inputs.grad is not None
+    assert inputs.grad.abs().sum() > 0
+    assert all(parameter.grad is None for parameter in network.parameters())
+
+
+def test_ensemble_members_are_separate_perceptrons() -> None:
+    ensemble, inputs = PerceptronEnsemble(2, (3, 8), generator=generator()), random(5, 3)
+    values = ensemble(inputs)
+    for member in range(2):
+        hidden = torch.relu(inputs @ ensemble.weights[0][member] + ensemble.biases[0][member])
+        expected = hidden @ ensemble.weights[1][member] + ensemble.biases[1][member]
+        torch.testing.assert_close(values[member], expected.squeeze(-1))
+    assert not torch.allclose(values[0], values[1])
+
+
+def test_starts_depend_on_the_generator_alone() -> None:
+    torch.manual_seed(0)
+    before = torch.get_rng_state()
+    first = Perceptron((3, 4, 1), generator=generator(5))
+    assert torch.equal(torch.get_rng_state(), before)
+    torch.manual_seed(1)
+    second = Perceptron((3, 4, 1), generator=generator(5))
+    for one, other in zip(first.parameters(), second.parameters(), strict=True):
+        assert torch.equal(one, other)
+
+
+def test_standardizer_leaves_constant_dimensions_undivided_and_bounds_the_rest() -> None:
+    scaling = Standardizer(torch.tensor([1.0, 5.0]), torch.tensor([2.0, 0.0]))
+    result = scaling(torch.tensor([[5.0, 5.0], [1e9, 5.5]]))
+    torch.testing.assert_close(result, torch.tensor([[2.0, 0.0], [LARGEST_INPUT, 0.5]]))
+
+
+def test_log_std_stays_in_range_and_keeps_its_gradient() -> None:
+    policy = GaussianPolicy(1, 1, hidden=(), log_std_range=(-5.0, 0.0), generator=generator())
+    with torch.no_grad():
+        policy.perceptron.layers[0].weight.copy_(torch.tensor([[0.0], [1.0]]))
+        policy.perceptron.layers[0].bias.zero_()
+    free = torch.tensor([[-30.0], [-2.5], [3.0], [30.0]], requires_grad=True)
+    _, log_std = policy(free)
+    assert log_std.min() >= -5.0
+    assert log_std.max() <= 0.01  # one softplus above the lower bound
+    log_std.sum().backward()
+    assert free.grad is not None
+    assert free.grad[1] > 0.8  # nearly the identity inside
+    assert free.grad[2] > 0.01  # a hard clamp would have none
+
+
+def test_log_probability_is_that_of_the_squashed_action() -> None:
+    """By change of variables, with the density of tanh(u) checked against a numerical integral."""
+    policy = GaussianPolicy(1, 1, hidden=(), log_std_range=(-20.0, 0.0), generator=generator())
+    inputs = torch.full((20_001, 1), 0.3)
+    mean, log_std = policy(inputs[:1])
+    actions = torch.linspace(-0.99999, 0.99999, 20_001).unsqueeze(-1)
+    noise = (torch.atanh(actions) - mean) / log_std.exp()
+    sample = policy.sample(inputs, noise)
+    torch.testing.assert_close(sample.actions, actions, atol=1e-4, rtol=0)
+    total = torch.trapezoid(sample.log_probabilities.exp(), actions.squeeze(-1))
+    assert total.item() == pytest.approx(1.0, abs=5e-3)
+
+
+def test_log_probability_is_finite_far_out() -> None:
+    policy = GaussianPolicy(1, 1, hidden=(), log_std_range=(-20.0, 0.0), generator=generator())
+    sample = policy.sample(torch.full((2, 1), 0.0), torch.tensor([[60.0], [-60.0]]))
+    assert torch.isfinite(sample.log_probabilities).all()
+    assert math.isclose(sample.actions.abs().max().item(), 1.0)

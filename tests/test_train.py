@@ -1,0 +1,354 @@
+"""Training: configuration, determinism, resuming, checkpoints, metrics, and `tcmrl train`."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from tcmrl_cli.frame import run
+from tcmrl_cli.train import tcmrl
+
+import tcmrl_algo
+from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
+from tcmrl_algo.config import TrainingSettings
+from tcmrl_algo.train import Progress
+from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
+
+SMALL = (
+    "run.log_every=10",
+    "run.checkpoint_every=25",
+    "batch.transitions=8",
+    "actor_critic.hidden=[8]",
+    "tcmrl.latent=4",
+    "tcmrl.encoder_hidden=[8]",
+    "tcmrl.tce_hidden=[8]",
+    "tcmrl.estimator_hidden=[8]",
+)
+Train = Callable[..., tcmrl_algo.TrainingReport]
+Call = Callable[..., tuple[int, str, str]]
+
+
+def config_of(dataset: Dataset, *overrides: str, algorithm: str | None = None) -> TrainingConfig:
+    table = dataset.manifest.training["quick"]
+    return resolve(table, place="quick", algorithm=algorithm, overrides=(*SMALL, *overrides))
+
+
+@pytest.fixture
+def start(tiny: Dataset, tmp_path: Path) -> Train:
+    """Trains a small run on the tiny dataset in a new folder."""
+
+    def start(name: str, *overrides: str, algorithm: str | None = None, **more: Any) -> Any:
+        config = config_of(tiny, *overrides, algorithm=algorithm)
+        return train_run(tiny, tmp_path / name, config=config, profile="quick", **more)
+
+    return start
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Call:
+    """Runs `tcmrl` in this process: exit code, standard output, standard error."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        code = run(tcmrl, [str(each) for each in arguments])
+        captured = capsys.readouterr()
+        return code, captured.out, captured.err
+
+    return call
+
+
+def assert_refused(result: tuple[int, str, str], *expected: str) -> None:
+    code, output, errors = result
+    assert code == 2
+    assert output == ""
+    lines = errors.strip().splitlines()
+    assert len(lines) == 1, lines
+    assert lines[0].startswith("Error: ")
+    for text in expected:
+        assert text in lines[0]
+
+
+def test_recipe_values_reach_the_run(tiny: Dataset) -> None:
+    settings = resolve(tiny.manifest.training["quick"], place="quick").settings
+    assert settings.actor_critic.gamma == 0.9
+    assert settings.batch.context_trajectories == (1, 2, 4)
+    paper = resolve(tiny.manifest.training["paper"], place="paper").settings
+    assert paper.run.steps == 100_000
+    assert paper.actor_critic.hidden == (256, 256, 256)
+
+
+def test_an_empty_table_resolves_to_sourced_defaults() -> None:
+    config = resolve({}, place="nothing")
+    assert config.settings == TrainingSettings()
+    assert config.method["latent"] == 20
+    assert TrainingConfig.model_validate_json(config.model_dump_json()) == config
+
+
+def test_overrides_come_last_and_keep_their_types(tiny: Dataset) -> None:
+    config = config_of(
+        tiny, "tcmrl.weights.negative=0", "actor_critic.brac.mode=policy", "batch.context_trajectories=[2]"
+    )
+    assert config.method["weights"]["negative"] == 0.0
+    assert config.method["weights"]["positive"] == 1.0
+    assert config.settings.actor_critic.brac.mode == "policy"
+    assert config.settings.batch.context_trajectories == (2,)
+
+
+@pytest.mark.parametrize(
+    ("override", "expected"),
+    [
+        ("tcmrl.latent=many", "latent"),
+        ("tcmrl.latent=2.5", "latent"),
+        ("tcmrl.latnet=3", "latnet"),
+        ("run.steps=true", "steps"),
+        ("actor_critic.gamma=1.5", "gamma"),
+        ("actor_critc.gamma=0.5", "actor_critc"),
+        ("batch.tasks=1", "tasks"),
+        ("nonsense", "nonsense"),
+    ],
+)
+def test_bad_overrides_are_named(tiny: Dataset, override: str, expected: str) -> None:
+    with pytest.raises(TcmrlError, match=expected) as caught:
+        config_of(tiny, override)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_unknown_algorithm_names_the_nearest(tiny: Dataset) -> None:
+    with pytest.raises(TcmrlError, match=r"tcmlr.*tcmrl"):
+        config_of(tiny, algorithm="tcmlr")
+
+
+@pytest.mark.parametrize("algorithm", ["tcmrl", "no_context"])
+def test_one_seed_gives_the_same_parameters_after_100_steps(start: Train, algorithm: str) -> None:
+    first = start("first", algorithm=algorithm, steps=100, seed=3)
+    torch.manual_seed(12345)  # the global state plays no part
+    second = start("second", algorithm=algorithm, steps=100, seed=3)
+    assert first.digest == second.digest
+    assert start("third", algorithm=algorithm, steps=100, seed=4).digest != first.digest
+
+
+@pytest.mark.parametrize("brac", ["off", "policy"])
+def test_resuming_at_50_gives_the_same_parameters_at_100(start: Train, tiny: Dataset, brac: str) -> None:
+    mode = f"actor_critic.brac.mode={brac}"
+    straight = start("straight", mode, steps=100)
+    half = start("half", mode, steps=50)
+    assert half.digest != straight.digest
+    resumed = resume_run(half.run.folder, tiny, steps=100)
+    assert resumed.digest == straight.digest
+    assert open_run(half.run.folder).newest().step == 100
+    lines = [_metrics(each.run.folder) for each in (straight, half)]
+    assert lines[0] == lines[1]
+
+
+def test_a_run_killed_between_checkpoints_resumes_from_the_last(
+    start: Train, tiny: Dataset, tmp_path: Path
+) -> None:
+    class Killed(Exception):
+        pass
+
+    def kill(progress: Progress) -> None:
+        if progress.step >= 40:
+            raise Killed
+
+    with pytest.raises(Killed):
+        start("killed", steps=60, report=kill)
+    killed = open_run(tmp_path / "killed")
+    assert killed.newest().step == 25
+    assert _metrics(killed.folder)[-1]["step"] == 40
+    resumed = resume_run(killed.folder, tiny)
+    straight = start("straight", steps=60)
+    assert resumed.digest == straight.digest
+    assert _metrics(killed.folder) == _metrics(straight.run.folder)  # what was logged beyond 25 is dropped
+
+
+def _metrics(folder: Path) -> list[dict[str, float]]:
+    lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    return [{name: each for name, each in line.items() if not name.startswith("time/")} for line in lines]
+
+
+def test_a_run_records_what_it_is_a_function_of(start: Train, tiny: Dataset) -> None:
+    report = start("run", steps=10, seed=7)
+    record = open_run(report.run.folder).record
+    assert (record.seed, record.steps, record.profile) == (7, 10, "quick")
+    assert record.root == tiny.manifest.root
+    assert record.config == config_of(tiny)
+    assert record.versions["torch"] == torch.__version__
+
+
+def test_metrics_are_logged_as_lines_and_to_tensorboard(start: Train) -> None:
+    folder = start("run", steps=25).run.folder
+    lines = _metrics(folder)
+    assert [line["step"] for line in lines] == [10, 20, 25]
+    assert {"loss/positive", "loss/negative", "loss/sparsity", "loss/contrastive", "loss/critic"} <= set(
+        lines[0]
+    )
+    assert list((folder / "tensorboard").glob("events*"))
+
+
+def test_only_the_newest_checkpoints_stay(start: Train) -> None:
+    found = start("run", steps=80).run.checkpoints()
+    assert [each.step for each in found] == [75, 80]
+    assert sorted(each.name for each in found[0].folder.iterdir()) == [
+        "checkpoint.json",
+        "tensors.safetensors",
+    ]
+
+
+def test_a_damaged_checkpoint_is_refused(start: Train, tiny: Dataset) -> None:
+    run = start("run", steps=10).run
+    file = run.newest().folder / "tensors.safetensors"
+    content = bytearray(file.read_bytes())
+    content[-1] ^= 1
+    file.write_bytes(bytes(content))
+    with pytest.raises(CheckpointError, match="damaged"):
+        resume_run(run.folder, tiny, steps=20)
+
+
+def test_an_edited_run_record_is_refused(start: Train) -> None:
+    run = start("run", steps=10).run
+    file = run.folder / "run.json"
+    file.write_text(file.read_text().replace('"seed"', '"sead"'))
+    with pytest.raises(CheckpointError, match=r"run\.json"):
+        open_run(run.folder)
+
+
+def test_a_run_goes_on_with_its_own_dataset_alone(start: Train, tiny: Dataset) -> None:
+    run = start("run", steps=10).run
+    manifest = tiny.manifest.model_copy(update={"root": "0" * 64})
+    other = Dataset(tiny.folder, manifest)
+    with pytest.raises(CheckpointError, match="root 000000000000"):
+        resume_run(run.folder, other, steps=20)
+    with pytest.raises(CheckpointError, match="at step 10 already"):
+        resume_run(run.folder, tiny, steps=5)
+
+
+def test_a_run_is_never_overwritten(start: Train) -> None:
+    start("run", steps=10)
+    with pytest.raises(CheckpointError, match="--resume"):
+        start("run", steps=10)
+
+
+def test_what_cannot_start_leaves_nothing(start: Train, tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match="--device 'nonsense'"):
+        start("run", device="nonsense")
+    with pytest.raises(SelectionError, match="steps>=9999"):
+        start("run", "run.snapshots=steps>=9999")
+    with pytest.raises(SelectionError, match="trajectories"):
+        start("run", "batch.context_trajectories=[50]")
+    assert not (tmp_path / "run").exists()
+
+
+def test_fewer_than_two_training_tasks_are_refused(tiny: Dataset, tmp_path: Path) -> None:
+    train, test = tiny.train_tasks[0], tiny.test_tasks[0]
+    kept = [each for each in tiny.manifest.tasks if each.index in (train.index, test.index)]
+    lone = Dataset(tiny.folder, tiny.manifest.model_copy(update={"tasks": tuple(kept)}))
+    with pytest.raises(SelectionError, match="at least 2 training tasks"):
+        train_run(lone, tmp_path / "run", config=config_of(tiny), profile="quick")
+
+
+def test_two_training_tasks_suffice(tiny: Dataset, tmp_path: Path) -> None:
+    chosen = {task.index for task in (*tiny.train_tasks[:2], *tiny.test_tasks)}
+    kept = [each for each in tiny.manifest.tasks if each.index in chosen]
+    pair = Dataset(tiny.folder, tiny.manifest.model_copy(update={"tasks": tuple(kept)}))
+    report = train_run(pair, tmp_path / "run", config=config_of(tiny), profile="quick", steps=5)
+    assert report.step == 5
+
+
+def test_a_loss_that_is_not_finite_stops_with_its_name_and_step(start: Train, tmp_path: Path) -> None:
+    with pytest.raises(TrainingError, match=r"is not finite at step \d+"):
+        start("run", "optimizer.learning_rate=1e30", steps=50)
+    assert not list((tmp_path / "run").glob("checkpoints/step_*"))
+
+
+def test_progress_is_reported_with_rates(start: Train) -> None:
+    seen: list[Progress] = []
+    start("run", steps=25, report=seen.append)
+    assert [(each.step, each.steps) for each in seen] == [(10, 25), (20, 25), (25, 25)]
+    assert all(each.rate > 0 for each in seen)
+
+
+def test_the_learning_rate_falls_linearly_to_its_share() -> None:
+    from tcmrl_algo.optimizer import Adam
+
+    layer = torch.nn.Linear(1, 1)
+    adam = Adam(layer, learning_rate=1.0, final_share=0.2, decay_steps=10)
+    rates = []
+    for done in (0, 5, 10, 30):
+        adam.step(layer.weight.sum(), steps_done=done)
+        rates.append(adam._adam.param_groups[0]["lr"])
+    assert rates == pytest.approx([1.0, 0.6, 0.2, 0.2])
+
+
+def test_gradients_are_bounded_where_asked() -> None:
+    from tcmrl_algo.optimizer import Adam
+
+    layer = torch.nn.Linear(1, 1, bias=False)
+    adam = Adam(layer, learning_rate=1e-3, gradient_norm=0.5)
+    adam.step(100.0 * layer.weight.sum())
+    assert layer.weight.grad is not None
+    assert layer.weight.grad.item() == pytest.approx(0.5, rel=1e-4)
+
+
+def test_train_command_prints_one_json_document(
+    tiny_folder: Path, tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    settings = [argument for text in SMALL for argument in ("--set", text)]
+    code, output, errors = call(
+        "train", tiny_folder / "manifest.json", "--seed", 2, "--steps", 20, *settings, "--json", "--quiet"
+    )
+    document = json.loads(output)
+    assert (code, errors) == (0, "")
+    assert set(document) == {
+        "run", "algorithm", "environment", "profile", "seed", "steps", "seconds", "digest"
+    }  # fmt: skip
+    assert document["run"] == "runs/point-robot-tcmrl-seed2"
+    code, output, errors = call("train", tiny_folder, "--seed", 2, "--steps", 30, "--resume")
+    assert code == 0
+    assert "30 steps" in output
+    assert "tcmrl evaluate runs/point-robot-tcmrl-seed2" in errors
+
+
+def test_train_command_refuses_bad_input_in_one_line(tiny_folder: Path, tmp_path: Path, call: Call) -> None:
+    out = ("--out", tmp_path / "run")
+    assert_refused(call("train", tmp_path / "none", *out), "none")
+    assert_refused(call("train", tiny_folder, "--algo", "tcmlr", *out), "tcmlr", "tcmrl")
+    assert_refused(call("train", tiny_folder, "--set", "tcmrl.latent=wide", *out), "latent", "wide")
+    assert_refused(call("train", tiny_folder, "--set", "run.snapshots=steps>=1", "--set", "x=1", *out), "x=1")
+    assert_refused(call("train", tiny_folder, "--set", "run.snapshots='steps>=999'", *out), "steps>=999")
+    assert_refused(call("train", tiny_folder, "--resume", *out), "no run")
+    assert_refused(call("train", tiny_folder, "--resume", "--set", "run.steps=3", *out), "--resume")
+    assert_refused(call("train", tiny_folder, "--steps", "0", *out), "--steps")
+    assert not (tmp_path / "run").exists()
+
+
+def test_resume_refuses_another_seed(start: Train, tiny_folder: Path, call: Call) -> None:
+    folder = start("run", steps=10, seed=1).run.folder
+    result = call("train", tiny_folder, "--resume", "--seed", 2, "--out", folder)
+    assert_refused(result, "--seed 1", "not 2")
+
+
+def test_help_shows_examples_and_imports_no_torch() -> None:
+    code = "import sys; from tcmrl_cli.train import tcmrl; tcmrl(['train', '--help'], standalone_mode=False);"
+    code += "sys.exit('torch' in sys.modules or 'stable_baselines3' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert "tcmrl train data/point-robot" in done.stdout
+
+
+def test_public_names_load() -> None:
+    for name in tcmrl_algo.__all__:
+        assert getattr(tcmrl_algo, name) is not None
+    assert set(dir(tcmrl_algo)) == set(tcmrl_algo.__all__)
+    with pytest.raises(AttributeError):
+        tcmrl_algo.nothing  # noqa: B018
+
+
+def test_run_settings_fields_are_documented() -> None:
+    from tcmrl_algo.config import RunSettings
+
+    for name in RunSettings.model_fields:
+        assert f"{name}:" in (RunSettings.__doc__ or "")
