@@ -32,6 +32,7 @@ $(INSTALLED_TEST): $(INSTALLED)
 demo: $(INSTALLED)
 	$(BIN)/tcmrl-data build point-robot --profile quick --seed $(SEED) --out $(DATA)
 	$(BIN)/tcmrl-data inspect returns $(DATA) --plot $(DATA)-returns.png
+	rm -rf $(RUN)
 	$(BIN)/tcmrl train $(DATA) --seed $(SEED) --out $(RUN)
 	$(BIN)/tcmrl evaluate $(RUN) --protocol all
 

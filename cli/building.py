@@ -98,9 +98,8 @@ def plan(
     if as_json:
         print_json(dataclasses.asdict(planned))
         return
-    table = make_table(
-        f"Plan: {planned.environment}, profile {planned.profile}", columns=["", " "], text=["", " "]
-    )
+    title = f"Plan: {planned.environment}, profile {planned.profile}"
+    table = make_table(title, columns=["what", "how much"], text=["what", "how much"])
     rows = {
         "behavior": planned.behavior,
         "tasks": f"{planned.tasks:,} ({planned.train:,} train, {planned.test:,} test)",

@@ -1,0 +1,113 @@
+"""What may import what, and what loads when: the parts of the layering that the import linter cannot see."""
+
+import ast
+import importlib
+import json
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import tcmrl_algo
+import tcmrl_data
+
+ROOT = Path(__file__).parents[1]
+FOLDERS = {
+    "tcmrl_algo": "tcmrl_algo",
+    "tcmrl_data": "tcmrl_data",
+    "cli": "tcmrl_cli",
+    "manifests": "tcmrl_manifests",
+}
+HEAVY = {"torch", "stable_baselines3", "metaworld", "mujoco", "matplotlib", "tensorboard"}
+
+
+def loaded_after(code: str, *arguments: str) -> set[str]:
+    """The heavy libraries that a fresh interpreter holds after running code."""
+    script = f"import json, sys\n{code}\nprint(json.dumps(sorted(sys.modules)), file=sys.stderr)"
+    result = subprocess.run(
+        [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=True
+    )
+    return HEAVY & set(json.loads(result.stderr.splitlines()[-1]))
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--help"],
+        ["build", "--help"],
+        ["envs"],
+        ["list", "PARENT"],
+        ["inspect", "returns", "DATASET"],
+        ["inspect", "returns", "DATASET", "--recompute"],
+        ["inspect", "tasks", "DATASET"],
+        ["inspect", "snapshots", "DATASET"],
+        ["inspect", "episodes", "DATASET"],
+    ],
+    ids=" ".join,
+)
+def test_looking_at_data_loads_nothing_heavy(arguments: list[str], tiny_folder: Path) -> None:
+    places = {"PARENT": str(tiny_folder.parent), "DATASET": str(tiny_folder)}
+    code = (
+        "from tcmrl_cli.data import data\n"
+        "from tcmrl_cli.frame import run\n"
+        "assert run(data, sys.argv[1:]) == 0\n"
+    )
+    assert loaded_after(code, *(places.get(each, each) for each in arguments)) == set()
+
+
+def test_a_plot_loads_matplotlib_and_no_window(tiny_folder: Path, tmp_path: Path) -> None:
+    code = (
+        "from tcmrl_cli.data import data\n"
+        "from tcmrl_cli.frame import run\n"
+        "assert run(data, sys.argv[1:]) == 0\n"
+        "assert 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    arguments = ["inspect", "returns", str(tiny_folder), "--plot", str(tmp_path / "returns.png")]
+    assert loaded_after(code, *arguments) == {"matplotlib"}
+
+
+@pytest.mark.parametrize("package", [tcmrl_data, tcmrl_algo], ids=lambda package: package.__name__)
+def test_roots_load_nothing_until_asked_and_keep_what_they_promise(package: object) -> None:
+    name = package.__name__  # type: ignore[attr-defined]
+    assert loaded_after(f"import {name}") == set()
+    root = importlib.import_module(name)
+    assert all(getattr(root, each) is not None for each in root.__all__)
+    assert set(root.__all__) <= set(dir(root))
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = root.nothing
+
+
+@pytest.mark.parametrize("module", ["losses", "networks"])
+def test_equations_and_networks_import_torch_and_shapes_only(module: str) -> None:
+    source = (ROOT / "tcmrl_algo" / f"{module}.py").read_text(encoding="utf-8")
+    imported = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            imported |= {alias.name.partition(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            imported.add((node.module or "").partition(".")[0])
+    assert imported - set(sys.stdlib_module_names) <= {"torch", "jaxtyping", "tcmrl_algo"}
+
+
+def test_every_package_of_the_tree_is_installed() -> None:
+    """A folder that is missing in pyproject.toml works in a checkout and is lost in a wheel."""
+    expected = {
+        ".".join([name, *path.parent.relative_to(ROOT / folder).parts])
+        for folder, name in FOLDERS.items()
+        for path in (ROOT / folder).rglob("*.py")
+    }
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
+    assert set(settings["packages"]) == expected
+
+
+def test_every_dependency_is_pinned_and_explained() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    wanted = project["dependencies"] + project["optional-dependencies"]["test"]
+    names = {text.partition(">")[0].lower() for text in wanted}
+    pins = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
+    pinned = {line.partition("==")[0].lower().replace("_", "-") for line in pins if "==" in line}
+    assert names <= pinned
+    explained = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert [name for name in sorted(names) if f"| {name} |" not in explained] == []

@@ -1,0 +1,166 @@
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from tcmrl_data import Dataset, Trajectory
+from tcmrl_data.discovery import modules, plugin
+from tcmrl_data.errors import SelectionError, StoreError
+from tcmrl_data.interchange.hdf5 import EPISODE_ARRAYS, export, read_hdf5
+from tests.conftest import TASKS
+from tests.strategies import trajectories
+
+FORMATS = [module.NAME for module in modules("tcmrl_data.interchange")]
+
+
+@pytest.fixture(scope="module")
+def exported(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("exports") / "flat"
+    export(tiny, out)
+    return out
+
+
+def assert_equal(left: Trajectory, right: Trajectory) -> None:
+    for name in EPISODE_ARRAYS:
+        one, other = getattr(left, name), getattr(right, name)
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+    assert left.extras.keys() == right.extras.keys()
+    for name, array in left.extras.items():
+        assert array.dtype == right.extras[name].dtype
+        np.testing.assert_array_equal(array, right.extras[name])
+
+
+@pytest.mark.parametrize("name", FORMATS)
+class TestEveryFormat:
+    """What `tcmrl-data export` relies on, whatever the format."""
+
+    def test_reports_progress_and_returns_existing_files(
+        self, name: str, tiny: Dataset, tmp_path: Path
+    ) -> None:
+        seen: list[tuple[int, int]] = []
+        files = plugin("tcmrl_data.interchange", "format", name).export(
+            tiny, tmp_path / "out", snapshots="last", progress=lambda done, total: seen.append((done, total))
+        )
+        assert seen == [(done, 5) for done in range(1, 6)]
+        assert all(file.is_file() and file.is_relative_to(tmp_path / "out") for file in files)
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+    def test_refuses_a_folder_in_use(self, name: str, tiny: Dataset, tmp_path: Path) -> None:
+        (tmp_path / "mine").write_text("mine")
+        with pytest.raises(StoreError, match="not empty"):
+            plugin("tcmrl_data.interchange", "format", name).export(tiny, tmp_path, snapshots="all")
+        assert [path.name for path in tmp_path.iterdir()] == ["mine"]
+
+    def test_a_failure_leaves_nothing(
+        self, name: str, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        original = Dataset.trajectories
+
+        def fail_late(self: Dataset, task: int, step: int) -> list[Trajectory]:
+            if task == TASKS[-1]:
+                raise StoreError("damaged")
+            return original(self, task, step)
+
+        monkeypatch.setattr(Dataset, "trajectories", fail_late)
+        with pytest.raises(StoreError, match="damaged"):
+            plugin("tcmrl_data.interchange", "format", name).export(tiny, tmp_path / "out", snapshots="all")
+        assert list(tmp_path.iterdir()) == []
+
+    def test_refuses_a_rule_that_leaves_nothing(self, name: str, tiny: Dataset, tmp_path: Path) -> None:
+        with pytest.raises(SelectionError):
+            plugin("tcmrl_data.interchange", "format", name).export(
+                tiny, tmp_path / "out", snapshots="steps>=1000"
+            )
+        assert list(tmp_path.iterdir()) == []
+
+
+def test_hdf5_reads_back_equal(tiny: Dataset, exported: Path) -> None:
+    for task in TASKS:
+        original = tiny.select(tasks=[task]).trajectories(task)
+        back = read_hdf5(exported / f"task_{task:05d}.hdf5")
+        assert len(back) == len(original) == 18
+        for left, right in zip(original, back, strict=True):
+            assert_equal(left, right)
+
+
+def test_hdf5_flat_arrays_are_the_transitions(tiny: Dataset, exported: Path) -> None:
+    episodes = tiny.select(tasks=[40]).trajectories(40)
+    with h5py.File(exported / "task_00040.hdf5") as file:
+        np.testing.assert_array_equal(
+            file["observations"][:], np.concatenate([each.observations[:-1] for each in episodes])
+        )
+        np.testing.assert_array_equal(
+            file["next_observations"][:], np.concatenate([each.observations[1:] for each in episodes])
+        )
+        for flat, name in {
+            "actions": "actions",
+            "rewards": "rewards",
+            "terminals": "terminated",
+            "timeouts": "truncated",
+        }.items():
+            np.testing.assert_array_equal(file[flat][:], np.concatenate([getattr(e, name) for e in episodes]))
+            assert file[flat].dtype == getattr(episodes[0], name).dtype
+        np.testing.assert_array_equal(file["episode"][:], np.repeat(np.arange(18), 20))
+        np.testing.assert_array_equal(file["step"][:], np.repeat([0, 100, 150], 120))
+        assert not file["terminals"][:].any()
+        assert file["timeouts"][:].sum() == 18
+
+
+def test_hdf5_says_where_it_comes_from(tiny: Dataset, exported: Path) -> None:
+    for task in tiny.tasks:
+        with h5py.File(exported / f"task_{task.index:05d}.hdf5") as file:
+            attributes = dict(file.attrs)
+        assert json.loads(attributes["parameters"]) == dict(task.parameters)
+        assert (attributes["task"], attributes["split"]) == (task.index, task.split)
+        assert (attributes["environment"], attributes["seed"]) == ("point-robot", 0)
+        assert attributes["dataset_root"] == tiny.manifest.root
+        assert attributes["snapshots"].tolist() == [0, 100, 150]
+
+
+def test_hdf5_takes_a_selection_of_snapshots(tiny: Dataset, tmp_path: Path) -> None:
+    export(tiny, tmp_path / "last", snapshots="last")
+    back = read_hdf5(tmp_path / "last" / "task_00000.hdf5")
+    for left, right in zip(tiny.trajectories(0, 150), back, strict=True):
+        assert_equal(left, right)
+
+
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(trajectories(), min_size=1, max_size=4))
+def test_hdf5_round_trip_of_any_episodes(
+    tiny: Dataset, tmp_path_factory: pytest.TempPathFactory, episodes: list[Trajectory]
+) -> None:
+    """Lengths 0 and 1, terminations and success flags; the same episodes stand for every part."""
+    out = tmp_path_factory.mktemp("round-trip") / "flat"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Dataset, "trajectories", lambda self, task, step: episodes)
+        export(tiny, out, snapshots="steps>=100")
+    for left, right in zip(episodes * 2, read_hdf5(out / "task_00000.hdf5"), strict=True):
+        assert_equal(left, right)
+    with h5py.File(out / "task_00000.hdf5") as file:
+        assert len(file["success"]) == len(file["rewards"]) == 2 * sum(map(len, episodes))
+
+
+def write_other_version(path: Path) -> None:
+    with h5py.File(path, "w") as file:
+        file.attrs["format_version"] = 99
+
+
+@pytest.mark.parametrize(
+    ("make", "expected"),
+    [
+        (lambda path: None, "does not open as HDF5"),
+        (lambda path: path.write_bytes(b"no HDF5"), "does not open as HDF5"),
+        (write_other_version, "format_version 99"),
+    ],
+)
+def test_read_hdf5_refuses_other_files(tmp_path: Path, make: Callable[[Path], None], expected: str) -> None:
+    path = tmp_path / "file.hdf5"
+    make(path)
+    with pytest.raises(StoreError, match=expected):
+        read_hdf5(path)

@@ -1,0 +1,106 @@
+import pytest
+
+import tcmrl_data
+from tcmrl_data import Dataset
+from tcmrl_data.errors import SelectionError, TaskError
+from tcmrl_data.returns import episode_table, first_disagreement, snapshot_table, summarize, task_table
+
+
+def snapshot(step: int, mean: float, success: float | None = None) -> dict[str, object]:
+    return {
+        "step": step,
+        "episodes": 2,
+        "steps": 10,
+        "mean": mean,
+        "std": 0.5,
+        "min": mean - 1.0,
+        "max": mean + 1.0,
+        "success_rate": success,
+    }
+
+
+def table(success: float | None = None) -> dict[str, object]:
+    return {
+        "name": "example",
+        "environment": "example",
+        "tasks": [
+            {
+                "task": 0,
+                "split": "train",
+                "snapshots": [snapshot(0, 1.0, success), snapshot(10, 4.0, success)],
+            },
+            {"task": 1, "split": "test", "snapshots": [snapshot(0, -7.0, success)]},
+            {
+                "task": 2,
+                "split": "train",
+                "snapshots": [snapshot(0, 3.0, success), snapshot(10, 8.0, success)],
+            },
+        ],
+    }
+
+
+def test_summary_is_over_tasks_with_splits_apart() -> None:
+    assert summarize(table()) == [
+        {
+            "step": 0,
+            "split": "train",
+            "tasks": 2,
+            "episodes": 4,
+            "mean": 2.0,
+            "std": 1.0,
+            "min": 1.0,
+            "max": 3.0,
+            "success_rate": None,
+        },
+        {
+            "step": 0,
+            "split": "test",
+            "tasks": 1,
+            "episodes": 2,
+            "mean": -7.0,
+            "std": 0.0,
+            "min": -7.0,
+            "max": -7.0,
+            "success_rate": None,
+        },
+        {
+            "step": 10,
+            "split": "train",
+            "tasks": 2,
+            "episodes": 4,
+            "mean": 6.0,
+            "std": 2.0,
+            "min": 4.0,
+            "max": 8.0,
+            "success_rate": None,
+        },
+    ]
+    assert {row["success_rate"] for row in summarize(table(0.25))} == {0.25}
+
+
+def test_a_disagreement_names_task_step_and_field() -> None:
+    changed = table()
+    changed["tasks"][2]["snapshots"][1]["max"] = 11.0  # type: ignore[index]
+    assert first_disagreement(table(), table()) is None
+    assert (
+        first_disagreement(table(), changed)
+        == "task 2 at step 10: max is 9.0 in part.json and 11.0 in the data"
+    )
+    assert first_disagreement(table(), table(1.0)) is not None
+
+
+def test_recomputed_returns_equal_the_recorded_ones(tiny: Dataset) -> None:
+    assert tcmrl_data.return_table(tiny, recompute=True) == tcmrl_data.return_table(tiny)
+
+
+def test_snapshot_and_task_tables_cover_the_dataset(tiny: Dataset) -> None:
+    rows = snapshot_table(tiny)["snapshots"]
+    assert len(rows) == len(tiny.manifest.parts)
+    assert [row["task"] for row in task_table(tiny)["tasks"]] == [task.index for task in tiny.tasks]
+
+
+def test_episode_table_refuses_what_is_not_there(tiny: Dataset) -> None:
+    with pytest.raises(TaskError, match="no task 7"):
+        episode_table(tiny, task=7)
+    with pytest.raises(SelectionError, match=r"step 77.*\[0, 100, 150\]"):
+        episode_table(tiny, step=77)
