@@ -8,7 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tcmrl_data.build import BuildEvent, BuildReport, build_dataset
+    from tcmrl_data.build import BuildReport, build_dataset
     from tcmrl_data.canonical import canonical_json, parse_json
     from tcmrl_data.dataset import Dataset, Selection, list_datasets, open_dataset
     from tcmrl_data.discovery import plugin
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
         make_environment,
     )
     from tcmrl_data.errors import CheckpointError, SelectionError, TcmrlError, TrainingError
+    from tcmrl_data.events import BuildEvent, BuildStatus, build_status
     from tcmrl_data.manifest import Manifest
     from tcmrl_data.plan import Plan, plan_build
     from tcmrl_data.recipe import (
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
     from tcmrl_data.trajectory import Trajectory
 
 _HOMES = {
-    "build": ("BuildEvent", "BuildReport", "build_dataset"),
+    "build": ("BuildReport", "build_dataset"),
     "canonical": ("canonical_json", "parse_json"),
     "dataset": ("Dataset", "Selection", "list_datasets", "open_dataset"),
     "discovery": ("plugin",),
@@ -51,6 +52,7 @@ _HOMES = {
         "environment_types",
         "make_environment",
     ),
+    "events": ("BuildEvent", "BuildStatus", "build_status"),
     "errors": ("CheckpointError", "SelectionError", "TcmrlError", "TrainingError"),
     "manifest": ("Manifest",),
     "plan": ("Plan", "plan_build"),
@@ -71,6 +73,7 @@ __all__ = [
     "BatchSizes",
     "BuildEvent",
     "BuildReport",
+    "BuildStatus",
     "CheckpointError",
     "Controller",
     "Dataset",
@@ -92,6 +95,7 @@ __all__ = [
     "UniformController",
     "apply_overrides",
     "build_dataset",
+    "build_status",
     "canonical_json",
     "draw_tasks",
     "environment_types",

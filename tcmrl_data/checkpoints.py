@@ -60,7 +60,7 @@ class CheckpointFolder:
         header = canonical_json({"key": self._key, "values": checkpoint.values}).decode()
         data = save(dict(checkpoint.arrays), metadata={"state": header})
         earlier = self._files()
-        replace_file(self._folder, f"{sha256(data)}.safetensors", data, staging=self._dataset / STAGING)
+        replace_file(self._folder / f"{sha256(data)}.safetensors", data, staging=self._dataset / STAGING)
         for file in earlier:
             file.unlink()
         self._saved = time.monotonic()

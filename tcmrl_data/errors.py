@@ -41,6 +41,10 @@ class BuildError(TcmrlError):
     """A build that cannot start, or units that failed."""
 
 
+class StorageError(BuildError):
+    """The disk refused an operation; what was published before stands."""
+
+
 class LockedError(BuildError):
     """Another process works on the dataset."""
 

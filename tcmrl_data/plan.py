@@ -15,7 +15,7 @@ from tcmrl_data.recipe import Recipe
 from tcmrl_data.rollout import roll_out
 from tcmrl_data.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.tasks import Task, choose_tasks
-from tcmrl_data.unit import behavior_source
+from tcmrl_data.unit import behavior_source, part_bytes
 
 PROBE_SECONDS = 6.0
 UNIT_START_SECONDS = 3.0
@@ -64,7 +64,6 @@ def plan_build(recipe: Recipe, *, tasks: Sequence[int] | None = None, workers: i
     workers = workers or os.cpu_count() or 1
     episodes, horizon = recipe.rollouts.episodes, environment.settings.horizon
     parts = len(chosen) * len(source.steps)
-    row_bytes = 4 * (environment.observation_dim + environment.action_dim + 1) + 2
     unit_seconds = (
         UNIT_START_SECONDS
         + source.training_steps * _training_seconds_per_step(recipe, environment, chosen[0])
@@ -82,7 +81,7 @@ def plan_build(recipe: Recipe, *, tasks: Sequence[int] | None = None, workers: i
         episodes=parts * episodes,
         training_steps=len(chosen) * source.training_steps,
         rollout_steps=parts * episodes * horizon,
-        bytes=parts * episodes * (horizon + 1) * row_bytes,
+        bytes=parts * part_bytes(recipe),
         workers=workers,
         seconds=unit_seconds * math.ceil(len(chosen) / workers),
     )

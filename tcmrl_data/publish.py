@@ -9,62 +9,99 @@ import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from tcmrl_data.errors import LockedError
+from tcmrl_data.errors import LockedError, StorageError
 
 STAGING = ".staging"
 LOCK = ".lock"
 CHECKPOINTS = ".checkpoints"
 
 
+class Disk:
+    """The operations that change what a disk holds; tests put one in its place that fails or forgets."""
+
+    def make_folder(self, path: Path) -> None:
+        """Makes one folder."""
+        path.mkdir()
+
+    def write(self, path: Path, data: bytes) -> None:
+        """Writes a new file; not forced to disk."""
+        with path.open("xb") as file:
+            file.write(data)
+
+    def sync(self, path: Path) -> None:
+        """Forces a file's content, or a folder's entries, to disk."""
+        descriptor = os.open(path, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+
+    def rename(self, source: Path, target: Path) -> None:
+        """Moves a file over another one, or a folder into an empty place, in one step."""
+        os.replace(source, target)
+
+
+disk = Disk()
+
+
 def write_file(path: Path, data: bytes) -> None:
-    """Writes a new file and forces it to disk."""
-    with path.open("xb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
+    """Writes a new file and forces its content, not its name, to disk.
+
+    Raises:
+        StorageError: the disk refuses.
+    """
+    with _named_errors(path):
+        disk.write(path, data)
+        disk.sync(path)
 
 
-def sync_folder(path: Path) -> None:
-    """Forces a folder's entries to disk."""
-    descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def make_folders(path: Path) -> None:
+    """Makes a folder and its parents, each name forced to disk."""
+    missing = [each for each in (path, *path.parents) if not each.exists()]
+    with _named_errors(path):
+        for each in reversed(missing):
+            disk.make_folder(each)
+            disk.sync(each.parent)
 
 
 def write_tree(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes files (relative path to content) into a new folder and forces all of it to disk."""
-    folder.mkdir()
-    folders = {folder}
-    for name, data in files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_file(path, data)
-        folders.update(parent for parent in path.parents if folder in parent.parents)
-    for each in sorted(folders, reverse=True):
-        sync_folder(each)
+    """Writes files (relative path to content) into a new folder and forces all of it to disk.
+
+    Raises:
+        StorageError: the disk refuses.
+    """
+    folders = {folder, *(folder / each for name in files for each in Path(name).parents)}
+    with _named_errors(folder):
+        for each in sorted(folders):
+            disk.make_folder(each)
+        for name, data in files.items():
+            write_file(folder / name, data)
+        for each in sorted(folders, reverse=True):
+            disk.sync(each)
 
 
 def sync_tree(folder: Path) -> None:
     """Forces everything below and including a folder to disk, for files that a library wrote."""
-    for path in folder.rglob("*"):
-        if path.is_file():
-            with path.open("rb") as file:
-                os.fsync(file.fileno())
-    for each in sorted([path for path in folder.rglob("*") if path.is_dir()], reverse=True):
-        sync_folder(each)
-    sync_folder(folder)
+    for each in sorted([folder, *folder.rglob("*")], reverse=True):
+        disk.sync(each)
 
 
-def replace_file(folder: Path, name: str, data: bytes, *, staging: Path) -> None:
-    """Puts `data` under folder/name in one step: readers see the old file or the new one."""
-    staging.mkdir(exist_ok=True)
-    folder.mkdir(parents=True, exist_ok=True)
-    temporary = staging / f"{name}.{uuid.uuid4().hex}"
-    write_file(temporary, data)
-    os.replace(temporary, folder / name)
-    sync_folder(folder)
+def replace_file(path: Path, data: bytes, *, staging: Path) -> None:
+    """Puts `data` at a path in one step: readers see the old file or the new one.
+
+    Raises:
+        StorageError: the disk refuses; the old file stands.
+    """
+    make_folders(staging)
+    make_folders(path.parent)
+    temporary = staging / f"{path.name}.{uuid.uuid4().hex}"
+    with _named_errors(path):
+        try:
+            write_file(temporary, data)
+            disk.rename(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+        disk.sync(path.parent)
 
 
 def remove_tree(folder: Path) -> None:
@@ -83,29 +120,49 @@ def publish_folder(dataset: Path, target: Path, files: Mapping[str, bytes], *, a
 
     Returns:
         False where a folder stands at `target` already; nothing is changed then.
+
+    Raises:
+        StorageError: the disk refuses; nothing is published.
     """
     staging = dataset / STAGING
-    staging.mkdir(exist_ok=True)
+    make_folders(staging)
     staged = staging / f"{attempt}.{uuid.uuid4().hex}"
     with lock_file(staged.with_name(f"{staged.name}.lock"), "this attempt") as lock:
         try:
             write_tree(staged, files)
             return move_into_place(staged, target)
         finally:
-            shutil.rmtree(staged, ignore_errors=True)
+            remove_tree(staged)
             lock.unlink(missing_ok=True)
 
 
 def move_into_place(staged: Path, target: Path) -> bool:
-    """Renames a synced folder to its final place; False where a folder that is not empty stands there."""
-    try:
-        os.rename(staged, target)
-    except OSError as error:
-        if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
-            return False
-        raise
-    sync_folder(target.parent)
+    """Renames a synced folder to its final place; False where a folder that is not empty stands there.
+
+    Raises:
+        StorageError: the disk refuses.
+    """
+    with _named_errors(target):
+        try:
+            disk.rename(staged, target)
+        except OSError as error:
+            if error.errno in (errno.ENOTEMPTY, errno.EEXIST):
+                return False
+            raise
+        disk.sync(target.parent)
     return True
+
+
+@contextlib.contextmanager
+def _named_errors(path: Path) -> Iterator[None]:
+    """Turns what the operating system reports into an error with a remedy."""
+    try:
+        yield
+    except OSError as error:
+        reason = os.strerror(error.errno) if error.errno else str(error)
+        raise StorageError(
+            f"cannot write {path}: {reason}; mend the disk, then run the same command again to go on"
+        ) from None
 
 
 @contextlib.contextmanager
@@ -119,25 +176,45 @@ def lock_file(path: Path, what: str) -> Iterator[Path]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            file.seek(0)
-            holder = file.read().strip() or "another process"
-            raise LockedError(f"{what} is being written by {holder}; wait for it or stop it") from None
+            raise LockedError(f"{what} is being written by {_holder(path)}; wait for it or stop it") from None
         file.truncate(0)
         file.write(f"process {os.getpid()} on {os.uname().nodename}")
         file.flush()
         yield path
 
 
+def lock_holder(path: Path) -> str | None:
+    """The process that holds a lock, or None where nobody does."""
+    if not path.is_file():
+        return None
+    with path.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return _holder(path)
+    return None
+
+
+def _holder(path: Path) -> str:
+    return path.read_text(errors="replace").strip()[:200] or "another process"
+
+
 def remove_abandoned(dataset: Path) -> list[str]:
-    """Removes staging whose lock can be taken, that is, whose owner is gone; returns what was removed."""
+    """Removes staging whose owner is gone; returns what was removed.
+
+    The caller holds the dataset's lock. What has a lock of its own is removed only if that lock can be
+    taken; what has none (a file on its way to its place) can only be a dead driver's, or a worker's whose
+    rename then fails and is tried again.
+    """
     staging = dataset / STAGING
     removed = []
     for lock in sorted(staging.glob("*.lock")) if staging.is_dir() else []:
         with contextlib.suppress(LockedError), lock_file(lock, lock.name):
-            shutil.rmtree(lock.with_suffix(""), ignore_errors=True)
+            remove_tree(lock.with_suffix(""))
             lock.unlink()
             removed.append(lock.stem)
-    for file in sorted(staging.glob("manifest.json.*")) if staging.is_dir() else []:
-        file.unlink()  # only the driver writes these, and the caller holds the driver's lock
-        removed.append(file.name)
+    for path in sorted(staging.iterdir()) if staging.is_dir() else []:
+        if path.is_file() and path.suffix != ".lock":
+            path.unlink()
+            removed.append(path.name)
     return removed

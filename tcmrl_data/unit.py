@@ -249,6 +249,13 @@ class _TaskRoller:
         )
 
 
+def part_bytes(recipe: Recipe) -> int:
+    """Size of a part's arrays before compression, for episodes of full length."""
+    environment = recipe.make_environment()
+    row_bytes = 4 * (environment.observation_dim + environment.action_dim + 1) + 2
+    return recipe.rollouts.episodes * (environment.settings.horizon + 1) * row_bytes
+
+
 def roll_out_part(
     spec: UnitSpec, environment: Environment, task: Task, snapshot: Snapshot, lanes: Lanes
 ) -> list[Trajectory]:

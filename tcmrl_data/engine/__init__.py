@@ -1,7 +1,7 @@
 """Engines run units somewhere, one engine a file: each module has NAME and a class Engine(workers)."""
 
 import abc
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,5 +54,5 @@ class BaseEngine(abc.ABC):
         self.workers = workers
 
     @abc.abstractmethod
-    def run(self, units: Sequence[Unit], on_message: Message) -> Iterator[Result]:
+    def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
         """Yields one result per unit as units end; closing the iterator stops what still runs."""

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from typing import Any, final
 
 from tcmrl_data.engine import BaseEngine, Message, Result, Unit
@@ -24,7 +24,7 @@ ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_
 class Engine(BaseEngine):
     """Up to `workers` subprocesses at a time, longest units first."""
 
-    def run(self, units: Sequence[Unit], on_message: Message) -> Iterator[Result]:
+    def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
         waiting: queue.SimpleQueue[Unit] = queue.SimpleQueue()
         for unit in sorted(units, key=lambda unit: -unit.cost):
             waiting.put(unit)
