@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 Activation = Callable[[Tensor], Tensor]
-SMALLEST_SCALE = 1e-6
-"""Input dimensions that vary less than this are constant: dividing by it would blow up rounding errors."""
+SMALLEST_SCALE = 1e-5
+"""Input dimensions that vary less than this are constant: dividing by less would blow up rounding errors."""
 LARGEST_INPUT = 10.0
 """Standardised inputs are clipped here, so that a state far from the data cannot drown all others."""
 

@@ -234,6 +234,13 @@ def test_updates_are_a_function_of_seed_and_step() -> None:
     )
 
 
+def test_every_step_has_its_own_generator() -> None:
+    draws = [torch.rand(3, generator=problem().generator(step)) for step in (1, 2, 1)]
+    assert torch.equal(draws[0], draws[2])
+    assert not torch.equal(draws[0], draws[1])
+    assert not torch.equal(torch.rand(3, generator=problem(seed=1).generator(1)), draws[0])
+
+
 @pytest.mark.parametrize("mode", ["off", "policy", "value"])
 def test_a_learner_goes_on_from_its_tensors(mode: str) -> None:
     straight, first, second = (learner(brac={"mode": mode}) for _ in range(3))
