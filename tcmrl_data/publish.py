@@ -64,6 +64,13 @@ def make_folders(path: Path) -> None:
             disk.sync(each.parent)
 
 
+def _make_staging(path: Path) -> None:
+    """Makes the staging folder; its name may be lost, since nothing in it is meant to last."""
+    if not path.is_dir():
+        with _named_errors(path), contextlib.suppress(FileExistsError):
+            disk.make_folder(path)
+
+
 def write_tree(folder: Path, files: Mapping[str, bytes]) -> None:
     """Writes files (relative path to content) into a new folder and forces all of it to disk.
 
@@ -92,7 +99,7 @@ def replace_file(path: Path, data: bytes, *, staging: Path) -> None:
     Raises:
         StorageError: the disk refuses; the old file stands.
     """
-    make_folders(staging)
+    _make_staging(staging)
     make_folders(path.parent)
     temporary = staging / f"{path.name}.{uuid.uuid4().hex}"
     with _named_errors(path):
@@ -125,7 +132,7 @@ def publish_folder(dataset: Path, target: Path, files: Mapping[str, bytes], *, a
         StorageError: the disk refuses; nothing is published.
     """
     staging = dataset / STAGING
-    make_folders(staging)
+    _make_staging(staging)
     staged = staging / f"{attempt}.{uuid.uuid4().hex}"
     with lock_file(staged.with_name(f"{staged.name}.lock"), "this attempt") as lock:
         try:
@@ -200,11 +207,10 @@ def _holder(path: Path) -> str:
 
 
 def remove_abandoned(dataset: Path) -> list[str]:
-    """Removes staging whose owner is gone; returns what was removed.
+    """Removes staging whose owner is gone; returns what was removed. The caller holds the dataset's lock.
 
-    The caller holds the dataset's lock. What has a lock of its own is removed only if that lock can be
-    taken; what has none (a file on its way to its place) can only be a dead driver's, or a worker's whose
-    rename then fails and is tried again.
+    An attempt is made after its lock and removed before it, so what has no lock has no owner; and files on
+    their way to their place belong to the lock's holder, or to a worker whose driver is gone.
     """
     staging = dataset / STAGING
     removed = []
@@ -214,7 +220,11 @@ def remove_abandoned(dataset: Path) -> list[str]:
             lock.unlink()
             removed.append(lock.stem)
     for path in sorted(staging.iterdir()) if staging.is_dir() else []:
-        if path.is_file() and path.suffix != ".lock":
+        if path.suffix == ".lock" or path.with_name(f"{path.name}.lock").exists():
+            continue
+        if path.is_dir():
+            remove_tree(path)
+        else:
             path.unlink()
-            removed.append(path.name)
+        removed.append(path.name)
     return removed

@@ -21,6 +21,17 @@ TINY = (
 )
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--sweep", type=int, default=40, help="try every n-th case of the exhaustive sweeps")
+
+
+@pytest.fixture
+def sweep(request: pytest.FixtureRequest) -> int:
+    """Stride through sweeps that take minutes in full; `--sweep 1` tries every case."""
+    stride: int = request.config.getoption("--sweep")
+    return stride
+
+
 @pytest.fixture(scope="session")
 def tiny_recipe() -> Recipe:
     return tcmrl_data.load_recipe("point-robot", profile="quick", overrides=TINY)
