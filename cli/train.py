@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import click
 
-from .frame import duration, make_table, number, output_options, print_json, print_table, remark, run
+from .frame import duration, output_options, print_json, print_table, remark, run
 from .progress import StageProgress
+from .scores import EXPLANATION, score_table
 
 if TYPE_CHECKING:
-    from tcmrl_algo import Evaluation, Progress, TrainingReport
+    from tcmrl_algo import Progress, TrainingReport
     from tcmrl_data import Dataset
 
 Profile = Literal["paper", "quick"]
@@ -257,40 +258,17 @@ def evaluate(
     results = []
     with StageProgress(quiet=quiet) as progress:
         for each in chosen:
-            results.append(evaluate_run(run_folder, protocol=each, dataset_path=dataset, episodes=episodes))
-            progress.update("evaluation", done=len(results), total=len(chosen), unit="protocols")
+            label = f"{each} " if each else ""
+
+            def show(stage: str, done: int, total: int, label: str = label) -> None:
+                progress.update(label + stage, done=done, total=total, unit="episodes")
+
+            results.append(
+                evaluate_run(run_folder, protocol=each, dataset_path=dataset, episodes=episodes, report=show)
+            )
     if as_json:
         documents = [each.to_json() for each in results]
         print_json(documents if protocol == "all" else documents[0])
         return
-    _print_table(results)
-    remark("other: the same policy under other tasks' contexts; regret: oracle - adapted", quiet=quiet)
-
-
-def _print_table(results: Sequence["Evaluation"]) -> None:
-    """One row per test task and one of means; under each protocol what adaptation and its control reach."""
-    first = results[0]
-    with_success = any(task.success is not None for each in results for task in each.tasks)
-    columns = ["task", "uniform", "oracle"]
-    for each in results:
-        columns += [f"{each.protocol}\n{what}" for what in ("adapted", "other", "regret")]
-        columns += [f"{each.protocol}\nsuccess"] if with_success else []
-    title = f"{first.algorithm} on {first.environment}, seed {first.seed}: returns on the test tasks"
-    table = make_table(title, columns=columns, text=("task",))
-    rows = []
-    for index, task in enumerate(first.tasks):
-        values = [task.random, task.oracle]
-        for each in results:
-            result = each.tasks[index]
-            values += [result.final, result.shuffled, result.regret]
-            values += [result.success] if with_success else []
-        rows.append(values)
-        table.add_row(str(task.task), *(number(value) for value in values))
-    table.add_section()
-    table.add_row("mean", *(number(_mean(column)) for column in zip(*rows, strict=True)))
-    print_table(table)
-
-
-def _mean(values: Sequence[float | None]) -> float | None:
-    known = [each for each in values if each is not None]
-    return sum(known) / len(known) if known and len(known) == len(values) else None
+    print_table(score_table(results))
+    remark(EXPLANATION, quiet=quiet)

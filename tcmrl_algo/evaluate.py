@@ -12,7 +12,7 @@ import torch
 
 from tcmrl_algo.checkpoint import Run, open_run
 from tcmrl_algo.config import Protocol, RunSettings
-from tcmrl_algo.protocols import PROTOCOLS, Adaptation, Arena, Context
+from tcmrl_algo.protocols import PROTOCOLS, Adaptation, Arena, Context, Report, ignore_progress
 from tcmrl_algo.train import create_algorithm
 from tcmrl_data import Dataset, Task, TrainingError, Trajectory, open_dataset
 
@@ -75,6 +75,7 @@ def evaluate_run(
     protocol: Protocol | None = None,
     dataset_path: str | Path | None = None,
     episodes: int | None = None,
+    report: Report = ignore_progress,
 ) -> Evaluation:
     """Evaluates the newest checkpoint of a run.
 
@@ -83,10 +84,15 @@ def evaluate_run(
         protocol: instead of the run's own.
         dataset_path: where the run's dataset lies now, if it has moved.
         episodes: adaptation episodes per task, instead of the run's own.
+        report: called as episodes end.
 
     Raises:
         CheckpointError: no run, no checkpoint, or another dataset than the run was trained on.
-        TrainingError: no test task, or an environment that cannot be evaluated.
+        TrainingError: the dataset holds no test task.
+
+    Example:
+        >>> evaluation = evaluate_run("runs/point-robot-tcmrl-seed0", protocol="idaq")  # doctest: +SKIP
+        >>> evaluation.mean_final, evaluation.mean_shuffled  # doctest: +SKIP
     """
     run = open_run(run_folder)
     dataset = open_dataset(dataset_path or run.record.dataset)
@@ -95,18 +101,21 @@ def evaluate_run(
     changes = {"protocol": protocol, "episodes": episodes}
     settings = settings.model_copy(update={key: each for key, each in changes.items() if each is not None})
     torch.set_num_threads(settings.threads)
-    return evaluate_open_run(run, dataset, settings)
+    return evaluate_open_run(run, dataset, settings, report=report)
 
 
-def evaluate_open_run(run: Run, dataset: Dataset, settings: RunSettings) -> Evaluation:
+def evaluate_open_run(
+    run: Run, dataset: Dataset, settings: RunSettings, *, report: Report = ignore_progress
+) -> Evaluation:
     """As `evaluate_run`, for what is already open; `settings` may differ from the run's own."""
     tasks = dataset.test_tasks
     if not tasks:
         raise TrainingError(f"{dataset.folder} holds no test task; build one with `tcmrl-data build --tasks`")
     algorithm = create_algorithm(run.record, dataset)
     algorithm.load_tensors(run.newest().tensors())
-    arena = Arena(dataset, algorithm, settings, seed=run.record.seed)
+    arena = Arena(dataset, algorithm, settings, seed=run.record.seed, report=report)
     try:
+        arena.begin("adaptation", len(tasks) * settings.episodes)
         adaptations = PROTOCOLS[settings.protocol](arena, tasks)
         results = _results(arena, tasks, adaptations)
     finally:
@@ -129,6 +138,8 @@ def evaluate_open_run(run: Run, dataset: Dataset, settings: RunSettings) -> Eval
 def _results(arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Adaptation]) -> list[TaskResult]:
     own = {task.index: each.contexts for task, each in zip(tasks, adaptations, strict=True)}
     others = {task.index: contexts_of_others(arena, task, own) for task in tasks}
+    num_contexts = sum(len(each) for each in (*own.values(), *others.values()))
+    arena.begin("final episodes", num_contexts * arena.settings.final_episodes)
     final = _final_episodes(arena, tasks, own)
     shuffled = _final_episodes(arena, tasks, others)
     results = []
@@ -154,17 +165,21 @@ def _results(arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Adaptati
 
 
 def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) -> list[Context]:
-    """Contexts of up to MOST_OTHERS other tasks, evenly spaced among them.
+    """As many contexts of other tasks as the task has of its own; at least one of each lender.
 
-    Other test tasks lend what they were adapted by; a lone test task borrows stored trajectories of
-    training tasks.
+    Up to MOST_OTHERS other test tasks, evenly spaced, lend in turn what they were adapted by; a lone test
+    task borrows stored trajectories of training tasks.
     """
+    num_own = len(own[task.index])
     others: list[list[Context]] = [contexts for index, contexts in own.items() if index != task.index]
     if not others:
-        draws = range(len(own[task.index]))
-        others = [[arena.stored(each, draw=draw) for draw in draws] for each in arena.dataset.train_tasks]
-    chosen = np.linspace(0, len(others) - 1, min(MOST_OTHERS, len(others))).round().astype(int)
-    return [context for index in chosen for context in others[index]]
+        others = [
+            [arena.stored(each, draw=draw) for draw in range(num_own)] for each in arena.dataset.train_tasks
+        ]
+    spread = np.linspace(0, len(others) - 1, min(MOST_OTHERS, len(others))).round().astype(int)
+    chosen = [others[index] for index in spread]
+    lanes = range(max(num_own, len(chosen)))
+    return [chosen[lane % len(chosen)][lane // len(chosen)] for lane in lanes]
 
 
 def _final_episodes(

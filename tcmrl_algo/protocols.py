@@ -21,10 +21,16 @@ from tcmrl_data import (
     roll_out,
 )
 
-MOST_LANES = 64
-"""Episodes stepped together; a Meta-World lane takes 20 MB."""
+MOST_LANES = 50
+"""Episodes stepped together; as many Meta-World lanes take 1 GB and 8 s to make."""
 
 Context = Sequence[Trajectory]
+Report = Callable[[str, int, int], None]
+"""Called with a stage, episodes done and episodes to do."""
+
+
+def ignore_progress(stage: str, done: int, total: int) -> None:
+    """Reports nothing."""
 
 
 @dataclass(frozen=True)
@@ -49,13 +55,27 @@ class Arena:
         algorithm: the trained method.
         settings: `[training.run]`.
         seed: the run's; addresses resets, noise and drawn contexts.
+        report: called with stage, episodes done and episodes to do, as episodes end.
     """
 
-    def __init__(self, dataset: Dataset, algorithm: Algorithm, settings: RunSettings, *, seed: int) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        algorithm: Algorithm,
+        settings: RunSettings,
+        *,
+        seed: int,
+        report: Report = ignore_progress,
+    ) -> None:
         self.dataset, self.settings = dataset, settings
-        self._algorithm, self._seed = algorithm, seed
-        self._lanes: dict[tuple[int, ...], Lanes] = {}
+        self._algorithm, self._seed, self._report = algorithm, seed, report
+        self._stage, self._done, self._total = "", 0, 0
+        self._lanes: tuple[tuple[int, ...], Lanes] | None = None
         self._stored: dict[int, list[Trajectory]] = {}
+
+    def begin(self, stage: str, total: int) -> None:
+        """Names what the coming episodes are for, and their number, for progress reports."""
+        self._stage, self._done, self._total = stage, 0, total
 
     def adapted(
         self, tasks: Sequence[Task], contexts: Sequence[Context], *, episode: int
@@ -83,22 +103,27 @@ class Arena:
         return [stored[index] for index in random.choice(len(stored), number, replace=False)]
 
     def close(self) -> None:
-        """Frees all lanes."""
-        for lanes in self._lanes.values():
-            lanes.close()
-        self._lanes.clear()
+        """Frees the lanes."""
+        if self._lanes is not None:
+            self._lanes[1].close()
+        self._lanes = None
+
+    def _lanes_of(self, tasks: Sequence[Task]) -> Lanes:
+        """Lanes of these tasks; the last ones are kept, since adaptation steps the same tasks again."""
+        key = tuple(task.index for task in tasks)
+        if self._lanes is None or self._lanes[0] != key:
+            self.close()
+            self._lanes = (key, self.dataset.environment.lanes([task.parameters for task in tasks]))
+        return self._lanes[1]
 
     def _run(
         self, tasks: Sequence[Task], controller: Controller, *, episode: int, first_lane: int
     ) -> list[Trajectory]:
         environment, name = self.dataset.environment, self.dataset.name
-        key = tuple(task.index for task in tasks)
-        if key not in self._lanes:
-            self._lanes[key] = environment.lanes([task.parameters for task in tasks])
         places = [(task.index, first_lane + lane) for lane, task in enumerate(tasks)]
-        return roll_out(
+        trajectories = roll_out(
             environment,
-            self._lanes[key],
+            self._lanes_of(tasks),
             controller,
             reset_seeds=[
                 keyed_seed(self._seed, name, task, Purpose.EVALUATION_RESET, episode, lane)
@@ -109,6 +134,9 @@ class Arena:
                 for task, lane in places
             ],
         )
+        self._done += len(tasks)
+        self._report(self._stage, self._done, self._total)
+        return trajectories
 
 
 def adapt_paper(arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:

@@ -85,6 +85,11 @@ def train_run(
         CheckpointError: the folder holds a run already.
         SelectionError: fewer than two training tasks, or too few snapshots or trajectories.
         TrainingError: an unusable device, or a loss that is not finite.
+
+    Example:
+        >>> dataset = tcmrl_data.open_dataset("data/point-robot")  # doctest: +SKIP
+        >>> config = resolve(dataset.manifest.training["quick"], place="quick")  # doctest: +SKIP
+        >>> train_run(dataset, "runs/first", config=config, profile="quick", seed=1)  # doctest: +SKIP
     """
     if (Path(out) / "run.json").exists():
         raise CheckpointError(f"{out} holds a run already; go on with --resume, or name another --out")
