@@ -9,6 +9,7 @@ from .building import build, plan
 from .frame import make_table, output_options, print_json, print_table, remark, run, size
 from .inspection import inspect
 from .progress import StageProgress
+from .status import status
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
@@ -35,7 +36,7 @@ def data() -> None:
     """
 
 
-for _command in (plan, build, inspect):
+for _command in (plan, build, status, inspect):
     data.add_command(_command)
 
 

@@ -82,7 +82,7 @@ def test_one_more_build_recovers_from_a_fault_at_any_operation(
     sweep: int,
 ) -> None:
     operations = len(log[1])
-    tried = range(FAULTS.index(fault), operations, sweep)
+    tried = range(FAULTS.index(fault) % sweep, operations, sweep)
     for at in tried:
         out = memory / f"{fault}-{at}" / "data"
         out.parent.mkdir()

@@ -1,0 +1,48 @@
+"""`tcmrl-data status`: how far a build is, asked from anywhere."""
+
+import dataclasses
+import time
+from pathlib import Path
+
+import click
+
+from .frame import duration, make_table, output_options, print_json, print_table
+
+
+@click.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@output_options
+def status(dataset: Path, as_json: bool, quiet: bool) -> None:
+    """Show how far the build of DATASET is, while it runs or after it ended.
+
+    \b
+    Examples:
+      tcmrl-data status data/point-robot
+      watch tcmrl-data status data/half-cheetah-vel
+    """
+    import tcmrl_data
+
+    found = tcmrl_data.build_status(dataset)
+    if as_json:
+        print_json(dataclasses.asdict(found))
+        return
+    rate, left, updated = found.steps_per_second, found.seconds_left, found.updated
+    if found.builder:
+        state = f"being built by {found.builder}"
+    else:
+        state = "complete" if found.complete else "incomplete; the same `tcmrl-data build` goes on"
+    rows = {
+        "environment": found.environment,
+        "state": state,
+        "parts": f"{found.parts_done:,} of {found.parts_total:,}, {found.tasks:,} tasks",
+        "running": ", ".join(found.running) or "nothing",
+        "rate": "unknown" if rate is None else f"{rate:,.0f} training steps/s",
+        "time left": "unknown" if left is None else f"about {duration(left)}",
+        "last word": "none" if updated is None else f"{duration(max(0.0, time.time() - updated))} ago",
+    }
+    table = make_table(str(dataset), columns=["what", "now"], text=["what", "now"])
+    for name, value in rows.items():
+        table.add_row(name, value)
+    for failure in found.failed:
+        table.add_row("failed", failure)
+    print_table(table)

@@ -1,0 +1,81 @@
+import json
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from tcmrl_data import build_status
+from tcmrl_data.events import EVENTS, BuildEvent, EventLog
+from tcmrl_data.publish import LOCK, lock_file
+from tests.conftest import TINY
+
+Copy = Callable[[], Path]
+
+
+def event(kind: str, unit: str | None = None, steps: int = 0, message: str = "") -> BuildEvent:
+    return BuildEvent(kind, unit, 0, 5, 0, 15, steps, 750, message)  # type: ignore[arg-type]
+
+
+def test_a_finished_build_says_so(tiny_folder: Path) -> None:
+    status = build_status(tiny_folder)
+    assert (status.complete, status.parts_done, status.parts_total) == (True, 15, 15)
+    assert (status.builder, status.running, status.failed) == (None, (), ())
+    kinds = [json.loads(line)["kind"] for line in (tiny_folder / EVENTS).read_text().splitlines()]
+    assert (kinds[0], kinds[-1], kinds.count("part"), kinds.count("unit_done")) == ("start", "end", 15, 5)
+
+
+def test_running_failed_and_rate_come_from_the_latest_build(tiny_copy: Copy) -> None:
+    folder = tiny_copy()
+    lines = [
+        event("start"),
+        event("steps", "task 7", 10),
+        event("steps", "task 8", 50),
+        event("part", "task 8"),
+    ]
+    lines += [event("unit_failed", "task 7", 100, "task 7 failed: why"), event("steps", "task 9", 150)]
+    with EventLog(folder, lambda _: None) as log:
+        for each in lines:
+            log.write(each)
+    rewritten = []
+    for second, line in enumerate((folder / EVENTS).read_text().splitlines()):
+        rewritten.append(json.dumps(json.loads(line) | {"time": 1000.0 + 10 * second}))
+    torn = rewritten[-1][: len(rewritten[-1]) // 2]
+    (folder / EVENTS).write_text("\n".join([*rewritten, torn, "[" * 9999, "3"]) + "\n")
+    idle = build_status(folder)
+    assert (idle.builder, idle.running, idle.failed) == (None, (), ("task 7 failed: why",))
+    with lock_file(folder / LOCK, "dataset"):
+        busy = build_status(folder)
+    assert busy.builder == f"process {os.getpid()} on {os.uname().nodename}"
+    assert busy.running == ("task 8",)
+    assert busy.steps_per_second is not None
+    assert busy.seconds_left is not None
+
+
+def test_steps_are_recorded_at_most_once_a_second_but_all_are_reported(tmp_path: Path) -> None:
+    reported: list[BuildEvent] = []
+    with EventLog(tmp_path, reported.append) as log:
+        for steps in range(50):
+            log.write(event("steps", "task 1", steps))
+    assert len(reported) == 50
+    assert 1 <= len((tmp_path / EVENTS).read_text().splitlines()) < 50
+
+
+def test_status_of_a_running_build_from_another_process(tmp_path: Path) -> None:
+    out = tmp_path / "running"
+    start = "from tcmrl_cli.data import main; main()"
+    options = ["--profile", "quick", "--tasks", "0,3", "--workers", "1", "--quiet", "--out", str(out)]
+    options += [word for each in TINY for word in ("--set", each)]
+    with subprocess.Popen([sys.executable, "-c", start, "build", "point-robot", *options]) as builder:
+        deadline = time.monotonic() + 60
+        while not (out / EVENTS).is_file() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        shown = subprocess.run(
+            [sys.executable, "-c", start, "status", str(out), "--json"], capture_output=True, check=True
+        )
+        document = json.loads(shown.stdout)
+        assert document["builder"].startswith(f"process {builder.pid} on ")
+        assert document["parts_total"] == 6
+        assert builder.wait() == 0
+    assert build_status(out).complete
