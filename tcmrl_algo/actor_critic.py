@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
 from tcmrl_algo.losses import dual_divergence, gradient_penalty, policy_loss, q_loss, value_loss
-from tcmrl_algo.networks import PerceptronEnsemble, Standardizer, call_frozen
+from tcmrl_algo.networks import Perceptron, PerceptronEnsemble, Standardizer, call_frozen
 from tcmrl_algo.optimizer import Adam
 from tcmrl_algo.policy import GaussianPolicy, PolicySample
 from tcmrl_algo.problem import Metrics, Problem
@@ -118,7 +118,7 @@ class ActorCritic(nn.Module):
         inputs, hidden = problem.observation_dim + latent, settings.hidden
         with_action = (inputs + problem.action_dim, *hidden)
         self.critics = PerceptronEnsemble(2, with_action, generator=generator)
-        self.value = PerceptronEnsemble(1, (inputs, *hidden), generator=generator)
+        self.value = Perceptron((inputs, *hidden, 1), generator=generator)
         self.target_value = copy.deepcopy(self.value).requires_grad_(False)
         self.policy = GaussianPolicy(
             inputs,
@@ -154,7 +154,7 @@ class ActorCritic(nn.Module):
         """
         settings = self.settings
         with torch.no_grad():
-            next_values = self.target_value(rows.next_inputs)[0]
+            next_values = self.target_value(rows.next_inputs).squeeze(-1)
             if settings.clip_targets:
                 next_values = next_values.clamp(*self.bounds)
         q_values = self.critics(torch.cat([rows.inputs, rows.actions], dim=-1))
@@ -176,7 +176,7 @@ class ActorCritic(nn.Module):
                 "actor_critic/divergence": divergence,
                 "actor_critic/brac_alpha": self.brac.alpha.clone(),
             }
-        values = self.value(rows.inputs)[0]
+        values = self.value(rows.inputs).squeeze(-1)
         state_value_loss = value_loss(values, targets)
         total = critic_loss + state_value_loss + actor_loss + self._regularization(sample)
         metrics |= {
@@ -237,7 +237,7 @@ class DualCritic(nn.Module):
     def __init__(self, settings: BracSettings, sizes: tuple[int, ...], *, generator: torch.Generator) -> None:
         super().__init__()
         self.settings = settings
-        self.network = PerceptronEnsemble(1, sizes, generator=generator)
+        self.network = Perceptron((*sizes, 1), generator=generator)
         self.optimizer = Adam(self.network, learning_rate=settings.learning_rate)
         self.register_buffer("alpha", torch.tensor(settings.alpha))
         self.register_buffer("last_divergence", torch.tensor(0.0))
@@ -245,7 +245,9 @@ class DualCritic(nn.Module):
     def divergence(self, rows: Rows, acted: Float[Tensor, "rows inputs"]) -> Tensor:
         """The estimate under a fixed dual critic; its gradient reaches the policy's actions."""
         behavior = torch.cat([rows.inputs, rows.actions], dim=-1)
-        result = dual_divergence(call_frozen(self.network, behavior)[0], call_frozen(self.network, acted)[0])
+        result = dual_divergence(
+            call_frozen(self.network, behavior).squeeze(-1), call_frozen(self.network, acted).squeeze(-1)
+        )
         self.last_divergence.copy_(result.detach())
         return result
 
@@ -254,8 +256,8 @@ class DualCritic(nn.Module):
         between = (mixture * rows.actions + (1.0 - mixture) * actions).requires_grad_()
         scores = self.network(torch.cat([rows.inputs, between], dim=-1))
         (gradients,) = torch.autograd.grad(scores.sum(), between, create_graph=True)
-        behavior = self.network(torch.cat([rows.inputs, rows.actions], dim=-1))[0]
-        policy = self.network(torch.cat([rows.inputs, actions], dim=-1))[0]
+        behavior = self.network(torch.cat([rows.inputs, rows.actions], dim=-1)).squeeze(-1)
+        policy = self.network(torch.cat([rows.inputs, actions], dim=-1)).squeeze(-1)
         loss = self.settings.penalty * gradient_penalty(gradients) - dual_divergence(behavior, policy)
         self.optimizer.step(loss)
 

@@ -324,7 +324,7 @@ def test_next_values_beyond_the_bounds_count_as_the_bound(clip: bool, same: bool
     found = []
     for factor in (2.0, 3.0):
         with torch.no_grad():
-            actor_critic.target_value.biases[-1].fill_(factor * actor_critic.bounds[1] + 1e3)
+            actor_critic.target_value.layers[-1].bias.fill_(factor * actor_critic.bounds[1] + 1e3)
         found.append(actor_critic.losses(rows, torch.Generator().manual_seed(0))[1]["loss/critic"].item())
     assert (found[0] == found[1]) is same
 
@@ -354,10 +354,10 @@ def test_target_follows_by_tau() -> None:
     made = ActorCriticSettings(hidden=(8,), tau=0.25)
     actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        actor_critic.value.biases[-1].fill_(4.0)
-        actor_critic.target_value.biases[-1].fill_(0.0)
+        actor_critic.value.layers[-1].bias.fill_(4.0)
+        actor_critic.target_value.layers[-1].bias.fill_(0.0)
     actor_critic.after_step()
-    assert actor_critic.target_value.biases[-1].item() == pytest.approx(1.0)
+    assert actor_critic.target_value.layers[-1].bias.item() == pytest.approx(1.0)
 
 
 def test_dual_critic_tells_a_far_policy_from_behavior_and_alpha_rises() -> None:
