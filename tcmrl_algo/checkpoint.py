@@ -114,7 +114,7 @@ class Run:
 
     def checkpoints(self) -> list[Checkpoint]:
         """Published checkpoints, ascending by step."""
-        folders = sorted(self.folder.glob("checkpoints/step_*"))
+        folders = sorted(self.folder.glob("checkpoints/step_" + 9 * "[0-9]"))
         return [Checkpoint(each, int(each.name.removeprefix("step_"))) for each in folders]
 
     def newest(self) -> Checkpoint:
@@ -129,7 +129,7 @@ class Run:
         return found[-1]
 
     def save(self, step: int, tensors: Mapping[str, Tensor]) -> None:
-        """Publishes a checkpoint by one rename, then removes all but the newest."""
+        """Publishes a checkpoint by one rename, then removes what is old or was never finished."""
         folder = self.folder / "checkpoints"
         staging = folder / f".staging-{uuid.uuid4().hex}"
         staging.mkdir(parents=True)
@@ -142,8 +142,9 @@ class Run:
             shutil.rmtree(target)
         staging.rename(target)
         _sync(folder)
-        for old in self.checkpoints()[:-KEPT]:
-            shutil.rmtree(old.folder)
+        left_over = list(folder.glob(".staging-*"))  # of a run killed while it saved
+        for old in (*left_over, *(each.folder for each in self.checkpoints()[:-KEPT])):
+            shutil.rmtree(old)
 
     def check_dataset(self, dataset: Dataset) -> None:
         """Refuses data that the run was not trained on.

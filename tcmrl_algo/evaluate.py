@@ -111,7 +111,8 @@ def evaluate_open_run(
     tasks = dataset.test_tasks
     if not tasks:
         raise TrainingError(f"{dataset.folder} holds no test task; build one with `tcmrl-data build --tasks`")
-    algorithm = create_algorithm(run.record, dataset)
+    on_cpu = run.record.model_copy(update={"device": "cpu"})  # the run's own may be another machine's
+    algorithm = create_algorithm(on_cpu, dataset)
     algorithm.load_tensors(run.newest().tensors())
     arena = Arena(dataset, algorithm, settings, seed=run.record.seed, report=report)
     try:

@@ -243,6 +243,15 @@ def test_a_moved_dataset_is_found_by_path_and_checked_by_root(
         evaluate_run(copied, dataset_path=tiny_copy())
 
 
+def test_a_run_trained_on_another_device_is_evaluated_on_the_cpu(trained: Path, tmp_path: Path) -> None:
+    copied = tmp_path / "run"
+    shutil.copytree(trained, copied)
+    expected = evaluate_run(copied)
+    record = json.loads((copied / "run.json").read_text())
+    (copied / "run.json").write_text(json.dumps(record | {"device": "cuda:7"}))
+    assert evaluate_run(copied) == expected
+
+
 def test_a_dataset_without_test_tasks_cannot_be_evaluated(
     trained: Path, tiny: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

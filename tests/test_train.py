@@ -188,8 +188,12 @@ def test_metrics_are_logged_as_lines_and_to_tensorboard(start: Train) -> None:
     assert list((folder / "tensorboard").glob("events*"))
 
 
-def test_only_the_newest_checkpoints_stay(start: Train) -> None:
-    found = start("run", steps=80).run.checkpoints()
+def test_only_the_newest_checkpoints_stay(start: Train, tiny: Dataset) -> None:
+    run = start("run", steps=30).run
+    (run.folder / "checkpoints" / ".staging-killed").mkdir()
+    resume_run(run.folder, tiny, steps=80)
+    found = run.checkpoints()
+    assert len(list((run.folder / "checkpoints").iterdir())) == 2
     assert [each.step for each in found] == [75, 80]
     assert sorted(each.name for each in found[0].folder.iterdir()) == [
         "checkpoint.json",
