@@ -226,8 +226,8 @@ def _check_finite(values: Mapping[str, Tensor], step: int) -> None:
         return
     name = next(name for name, finite in zip(values, bad, strict=True) if not finite)
     raise TrainingError(
-        f"{name} is not finite at step {step}; the last checkpoint is intact: lower optimizer.learning_rate, "
-        "or bound optimizer.gradient_norm, with --set"
+        f"{name} is not finite at step {step}; the last checkpoint, if any, is intact; lower "
+        "optimizer.learning_rate or bound optimizer.gradient_norm with --set"
     )
 
 
