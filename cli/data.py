@@ -138,7 +138,8 @@ def export(
 
     exporter = tcmrl_data.plugin("tcmrl_data.interchange", "format", format_name)
     opened = tcmrl_data.open_dataset(dataset)
-    target = out or opened.folder.resolve().with_name(f"{opened.folder.resolve().name}-{format_name}")
+    folder = opened.folder if opened.folder.name not in ("", "..") else opened.folder.resolve()
+    target = out or folder.with_name(f"{folder.name}-{format_name}")
     with StageProgress(quiet=quiet) as progress:
         files = exporter.export(
             opened,
