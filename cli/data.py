@@ -1,4 +1,4 @@
-"""`tcmrl-data`: plan, build, list, inspect and export datasets."""
+"""`tcmrl-data`: plan, build, list, inspect, verify, repair and export datasets."""
 
 import sys
 from pathlib import Path
@@ -10,6 +10,7 @@ from .frame import make_table, output_options, print_json, print_table, remark, 
 from .inspection import inspect
 from .progress import StageProgress
 from .status import status
+from .verification import gc, import_policy, repair, verify
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
@@ -36,7 +37,7 @@ def data() -> None:
     """
 
 
-for _command in (plan, build, status, inspect):
+for _command in (plan, build, status, inspect, verify, repair, gc, import_policy):
     data.add_command(_command)
 
 
@@ -93,8 +94,8 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
         remark(f"no datasets below {root}; build one with `tcmrl-data build ENV`", quiet=quiet)
         return
     columns = ["dataset", "environment", "profile", "behavior", "seed", "tasks", "parts", "state", "root"]
-    words = ["dataset", "environment", "profile", "behavior", "state", "root"]
-    table = make_table(f"Datasets below {root}", columns=columns, text=words)
+    words = ["environment", "profile", "behavior", "root"]
+    table = make_table(f"Datasets below {root}", columns=columns, text=words, long_text=["dataset", "state"])
     for row in rows:
         if "error" in row:
             table.add_row(row["path"], *[""] * 6, f"unreadable: {row['error']}", "")

@@ -1,6 +1,8 @@
 """The frame around every command: options they share, one-line errors, exit codes, JSON and tables."""
 
+import io
 import json
+import shlex
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -8,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from tcmrl_data.errors import TcmrlError
+from tcmrl_data.plain_files import printable
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -31,8 +34,12 @@ def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
         command: the root command.
         arguments: what follows the program's name; those of this process where None.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without Unicode gets question marks
+    typed = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        result = command.main(args=arguments, prog_name=command.name, standalone_mode=False)
+        result = command.main(args=typed, prog_name=command.name, standalone_mode=False, obj=typed)
     except click.exceptions.NoArgsIsHelpError as error:
         error.show()
         return BAD_INPUT
@@ -55,6 +62,12 @@ def fail_incomplete(message: str) -> None:
     click.get_current_context().exit(_fail(message, INCOMPLETE))
 
 
+def typed_command() -> str:
+    """The running command as it was typed, to be run again."""
+    context = click.get_current_context().find_root()
+    return shlex.join([str(context.info_name), *context.obj])
+
+
 def output_options(command: Command) -> Command:
     """Adds `--json` and `--quiet`."""
     as_json = click.option(
@@ -73,27 +86,30 @@ def print_table(table: "Table") -> None:
     """Prints a table on standard output: as wide as the terminal, or as wide as it needs in a pipe."""
     from rich.console import Console
 
-    Console(width=None if sys.stdout.isatty() else PIPE_WIDTH).print(table)
+    Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, markup=False, emoji=False).print(table)
 
 
-def make_table(title: str, *, columns: Iterable[str], text: Iterable[str] = ()) -> "Table":
+def make_table(
+    title: str, *, columns: Iterable[str], text: Iterable[str] = (), long_text: Iterable[str] = ()
+) -> "Table":
     """An empty table.
 
     Args:
         title: stands above it.
         columns: headings, left to right.
         text: columns that hold words and align left; all others hold numbers and align right.
+        long_text: like `text`, but broken into lines where the terminal is narrow.
     """
     from rich import box
     from rich.table import Table
 
     table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
-    words = set(text)
+    words, sentences = set(text), set(long_text)
     for column in columns:
-        if column in words:
-            table.add_column(column, overflow="fold")
+        if column in sentences:
+            table.add_column(column, overflow="fold", min_width=12)
         else:
-            table.add_column(column, justify="right", no_wrap=True)
+            table.add_column(column, justify="left" if column in words else "right", no_wrap=True)
     return table
 
 
@@ -127,5 +143,5 @@ def size(num_bytes: float) -> str:
 
 
 def _fail(message: str, code: int) -> int:
-    click.echo(f"Error: {' '.join(message.split())}", err=True)
+    click.echo(f"Error: {printable(' '.join(message.split()))}", err=True)
     return code

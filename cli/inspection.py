@@ -105,7 +105,8 @@ def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
     table = make_table(
         f"{document['name']}: tasks",
         columns=["task", "split", "parameters", *references],
-        text=["split", "parameters"],
+        text=["split"],
+        long_text=["parameters"],
     )
     for row in document["tasks"]:
         known = row["references"] or dict.fromkeys(references)

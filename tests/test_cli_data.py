@@ -211,6 +211,18 @@ def test_inspect_tasks_shows_split_parameters_and_references(call: Call, tiny: D
     assert "goal=[1.0, 0.0]" in call("inspect", "tasks", tiny.folder)[1]
 
 
+def test_an_output_without_unicode_gets_question_marks(tiny: Dataset) -> None:
+    result = subprocess.run(
+        [sys.executable, "-c", MAIN, "inspect", "tasks", str(tiny.folder)],
+        capture_output=True,
+        text=True,
+        check=True,
+        env=os.environ | {"PYTHONIOENCODING": "ascii"},
+    )
+    assert "train" in result.stdout
+    assert result.stderr == ""
+
+
 def test_inspect_snapshots_shows_every_part(call: Call, tiny: Dataset) -> None:
     rows = json.loads(call("inspect", "snapshots", tiny.folder, "--json")[1])["snapshots"]
     assert [(row["task"], row["step"], row["id"]) for row in rows] == [
