@@ -6,6 +6,8 @@ from pathlib import Path
 
 import click
 
+from tcmrl_data.plain_files import printable
+
 from .frame import duration, make_table, output_options, print_json, print_table
 
 
@@ -42,7 +44,7 @@ def status(dataset: Path, as_json: bool, quiet: bool) -> None:
     }
     table = make_table(str(dataset), columns=["what", "now"], text=["what", "now"])
     for name, value in rows.items():
-        table.add_row(name, value)
+        table.add_row(name, printable(value))
     for failure in found.failed:
-        table.add_row("failed", failure)
+        table.add_row("failed", printable(failure))
     print_table(table)

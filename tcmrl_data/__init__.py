@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     )
     from tcmrl_data.errors import CheckpointError, SelectionError, TcmrlError, TrainingError
     from tcmrl_data.events import BuildEvent, BuildStatus, build_status
+    from tcmrl_data.garbage import Garbage, collect_garbage
     from tcmrl_data.manifest import Manifest
     from tcmrl_data.plan import Plan, plan_build
     from tcmrl_data.recipe import (
@@ -32,12 +33,16 @@ if TYPE_CHECKING:
         list_environments,
         load_recipe,
     )
+    from tcmrl_data.repair import RepairReport, repair_dataset
+    from tcmrl_data.replay import Replay
     from tcmrl_data.returns import return_table
     from tcmrl_data.rollout import roll_out
     from tcmrl_data.sampler import Batch, BatchSizes, Moments, Sampler, Steps
     from tcmrl_data.seeding import NO_TASK, Purpose, keyed_generator, keyed_seed
+    from tcmrl_data.snapshot import import_sac
     from tcmrl_data.tasks import Task, draw_tasks, parse_indices
     from tcmrl_data.trajectory import Trajectory
+    from tcmrl_data.verify import Finding, VerifyLevel, VerifyReport, verify_dataset
 
 _HOMES = {
     "build": ("BuildReport", "build_dataset"),
@@ -54,15 +59,20 @@ _HOMES = {
     ),
     "events": ("BuildEvent", "BuildStatus", "build_status"),
     "errors": ("CheckpointError", "SelectionError", "TcmrlError", "TrainingError"),
+    "garbage": ("Garbage", "collect_garbage"),
     "manifest": ("Manifest",),
     "plan": ("Plan", "plan_build"),
     "recipe": ("PROFILES", "Recipe", "apply_overrides", "first_problem", "list_environments", "load_recipe"),
+    "repair": ("RepairReport", "repair_dataset"),
+    "replay": ("Replay",),
     "returns": ("return_table",),
     "rollout": ("roll_out",),
     "sampler": ("Batch", "BatchSizes", "Moments", "Sampler", "Steps"),
     "seeding": ("NO_TASK", "Purpose", "keyed_generator", "keyed_seed"),
+    "snapshot": ("import_sac",),
     "tasks": ("Task", "draw_tasks", "parse_indices"),
     "trajectory": ("Trajectory",),
+    "verify": ("Finding", "VerifyLevel", "VerifyReport", "verify_dataset"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -78,12 +88,16 @@ __all__ = [
     "Controller",
     "Dataset",
     "Environment",
+    "Finding",
+    "Garbage",
     "Lanes",
     "Manifest",
     "Moments",
     "Plan",
     "Purpose",
     "Recipe",
+    "RepairReport",
+    "Replay",
     "Sampler",
     "Selection",
     "SelectionError",
@@ -93,13 +107,17 @@ __all__ = [
     "TrainingError",
     "Trajectory",
     "UniformController",
+    "VerifyLevel",
+    "VerifyReport",
     "apply_overrides",
     "build_dataset",
     "build_status",
     "canonical_json",
+    "collect_garbage",
     "draw_tasks",
     "environment_types",
     "first_problem",
+    "import_sac",
     "keyed_generator",
     "keyed_seed",
     "list_datasets",
@@ -111,8 +129,10 @@ __all__ = [
     "parse_json",
     "plan_build",
     "plugin",
+    "repair_dataset",
     "return_table",
     "roll_out",
+    "verify_dataset",
 ]
 
 

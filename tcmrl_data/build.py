@@ -16,6 +16,7 @@ from tcmrl_data.events import EVENTS, BuildEvent, EventLog
 from tcmrl_data.manifest import DATA_VERSION, MANIFEST, read_manifest
 from tcmrl_data.publish import CHECKPOINTS, LOCK, STAGING, lock_file, make_folders, remove_abandoned
 from tcmrl_data.recipe import Recipe
+from tcmrl_data.scan import check_work_files
 from tcmrl_data.tasks import Task, choose_tasks
 from tcmrl_data.unit import part_bytes
 
@@ -94,6 +95,7 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
         return
     if not out.is_dir() or {entry.name for entry in out.iterdir()} - OWN_FILES:
         raise BuildError(f"--out {out} exists and is no dataset; choose another folder")
+    check_work_files(out)
     if not (out / MANIFEST).is_file():
         return
     manifest = read_manifest(out)

@@ -2,9 +2,15 @@
 
 import hashlib
 import json
+import math
 from typing import Any, NoReturn
 
-MAX_JSON_BYTES = 64 * 2**20
+MAX_JSON_BYTES = 16 * 2**20
+"""About 90,000 parts in a manifest."""
+
+MAX_JSON_VALUES = 2**20
+"""A parsed value takes up to about 100 bytes; empty lists, the worst, take 3 bytes of text each."""
+
 MAX_JSON_DEPTH = 32
 
 
@@ -25,37 +31,55 @@ def digest(value: Any) -> str:
 
 
 def parse_json(data: bytes) -> Any:
-    """Parses JSON of a stranger: size and depth bounded, no duplicate keys, no NaN or infinity.
+    """Parses JSON of a stranger: bounded in size, values and depth; no duplicate keys, NaN or infinity.
 
     Raises:
         ValueError: what is wrong, without the file's name; callers add it.
     """
     if len(data) > MAX_JSON_BYTES:
         raise ValueError(f"{len(data)} bytes of JSON exceed the limit of {MAX_JSON_BYTES}")
+    if sum(map(data.count, (b",", b"[", b"{"))) > MAX_JSON_VALUES:
+        raise ValueError(f"JSON holds more than {MAX_JSON_VALUES} values")
     if _depth(data) > MAX_JSON_DEPTH:
         raise ValueError(f"JSON is nested deeper than {MAX_JSON_DEPTH}")
-    return json.loads(data.decode("utf-8"), object_pairs_hook=_unique, parse_constant=_no_constant)
+    return json.loads(
+        data.decode("utf-8"),
+        object_pairs_hook=_unique,
+        parse_constant=_no_constant,
+        parse_float=_finite,
+    )
 
 
 def _depth(data: bytes) -> int:
     """An upper bound on nesting, without recursion: brackets inside strings only make it stricter."""
     depth = deepest = 0
-    for byte in data:
+    for byte in data.translate(None, delete=_NO_BRACKETS):
         if byte in b"[{":
             depth += 1
             deepest = max(deepest, depth)
-        elif byte in b"]}":
+        else:
             depth -= 1
     return deepest
+
+
+_NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):
-        keys = [key for key, _ in pairs]
-        raise ValueError(f"duplicate key {next(key for key in keys if keys.count(key) > 1)!r}")
+        seen: set[str] = set()
+        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"duplicate key {twice[:80]!r}")
     return result
 
 
 def _no_constant(name: str) -> NoReturn:
     raise ValueError(f"{name} is not allowed")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:40]} is too large for a number")
+    return value

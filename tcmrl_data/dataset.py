@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import ValidationError
 
-from tcmrl_data.canonical import sha256
 from tcmrl_data.environment import Environment
-from tcmrl_data.errors import ManifestError, SelectionError, StoreError, TaskError
+from tcmrl_data.errors import ManifestError, SelectionError, StoreError, TaskError, TrajectoryError
+from tcmrl_data.layout import ArrayLayout, check_expansion
 from tcmrl_data.manifest import (
     MANIFEST,
     Manifest,
@@ -20,10 +21,13 @@ from tcmrl_data.manifest import (
     TaskReferences,
     part_folder,
     read_manifest,
-    read_part_record,
+    read_sealed_part,
 )
+from tcmrl_data.part_files import check_files
+from tcmrl_data.plain_files import folder_problem
+from tcmrl_data.recipe import first_problem
 from tcmrl_data.snapshot import Snapshot, read_snapshot
-from tcmrl_data.store import check_layout, read_arrays, unpack
+from tcmrl_data.store import read_arrays, unpack
 from tcmrl_data.tasks import Split, Task
 from tcmrl_data.trajectory import Trajectory
 
@@ -47,24 +51,16 @@ def open_dataset(path: str | Path) -> "Dataset":
     """
     folder = Path(path).parent if Path(path).name == MANIFEST else Path(path)
     dataset = Dataset(folder, read_manifest(folder))
+    layouts: list[ArrayLayout] = []
     for entry in dataset.manifest.parts:
-        _check_files(dataset.folder_of(entry.task, entry.step), dataset.part(entry.task, entry.step))
+        problem = folder_problem(folder, part_folder(entry.task, entry.step))
+        if problem:
+            raise StoreError(f"{folder / problem[0]} {problem[1]}; run `tcmrl-data repair {folder}`")
+        layouts += check_files(
+            dataset.folder_of(entry.task, entry.step), dataset.part(entry.task, entry.step)
+        )
+    check_expansion(layouts, dataset.stored_bytes, folder)
     return dataset
-
-
-def _check_files(folder: Path, record: PartRecord) -> None:
-    check_layout(folder, {name: each.model_dump() for name, each in record.identity.arrays.items()})
-    for name, expected in record.files.items():
-        file = folder / name
-        if not file.is_file() or any(
-            each.is_symlink() for each in (file, *file.parents[: name.count("/") + 1])
-        ):
-            raise StoreError(f"{file} is missing or no plain file; delete {folder} and build again")
-        if file.stat().st_size != expected.size:
-            raise StoreError(
-                f"{file} has {file.stat().st_size} bytes instead of {expected.size}; "
-                f"delete {folder} and build again"
-            )
 
 
 class Dataset:
@@ -89,8 +85,24 @@ class Dataset:
 
     @functools.cached_property
     def environment(self) -> Environment:
-        """The environment that the data came from."""
-        return self.manifest.recipe.make_environment()
+        """The environment that the data came from.
+
+        Raises:
+            ManifestError: settings that the environment does not take.
+            UnknownNameError: no such environment.
+        """
+        try:
+            return self.manifest.recipe.make_environment()
+        except ValidationError as error:
+            raise ManifestError(
+                f"{self.folder / MANIFEST}: recipe.environment: {first_problem(error)}"
+            ) from None
+
+    @property
+    def stored_bytes(self) -> int:
+        """Bytes of all recorded files of the parts that the manifest names."""
+        records = (self.part(entry.task, entry.step) for entry in self.manifest.parts)
+        return sum(file.size for record in records for file in record.files.values())
 
     @property
     def train_tasks(self) -> tuple[Task, ...]:
@@ -145,12 +157,14 @@ class Dataset:
             raise SelectionError(f"{self.folder} has no part of task {task} at step {step}")
         if (task, step) not in self._records:
             file = self.folder_of(task, step) / "part.json"
-            if not file.is_file() or file.is_symlink():
-                raise StoreError(f"{file} is missing or no plain file; delete its folder and build again")
             entry = self._entries[task, step]
-            record = read_part_record(file)
-            if sha256(file.read_bytes()) != entry.sha256 or record.id != entry.id:
-                raise ManifestError(f"{file}: is not the record that the manifest names; build again")
+            record, sealed = read_sealed_part(file)
+            if sealed != entry.sha256 or record.id != entry.id:
+                raise ManifestError(
+                    f"{file}: is not the record that the manifest names; run `tcmrl-data repair`"
+                )
+            if (record.identity.task, record.identity.step) != (task, step):
+                raise ManifestError(f"{file}: identity.task and identity.step name another part")
             self._records[task, step] = record
         return self._records[task, step]
 
@@ -159,8 +173,16 @@ class Dataset:
         return read_arrays(self.folder_of(task, step), self.part(task, step).identity.arrays)
 
     def trajectories(self, task: int, step: int) -> list[Trajectory]:
-        """The episodes of a part."""
-        return unpack(self.arrays(task, step))
+        """The episodes of a part.
+
+        Raises:
+            StoreError: arrays that do not decode or do not form episodes.
+        """
+        arrays = self.arrays(task, step)
+        try:
+            return unpack(arrays)
+        except (StoreError, TrajectoryError) as error:
+            raise StoreError(f"{self.folder_of(task, step)}: {error}; run `tcmrl-data repair`") from None
 
     def snapshot(self, task: int, step: int) -> Snapshot:
         """The behavior policy of a part."""

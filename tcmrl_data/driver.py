@@ -10,6 +10,7 @@ from tcmrl_data.canonical import sha256
 from tcmrl_data.engine import BaseEngine, Result, Unit
 from tcmrl_data.errors import StoreError
 from tcmrl_data.events import BuildEvent, EventKind, EventLog
+from tcmrl_data.layout import GROUP, check_layout
 from tcmrl_data.manifest import (
     DATA_VERSION,
     MANIFEST,

@@ -142,9 +142,18 @@ def _latest_build(path: Path) -> list[dict[str, Any]]:
             event = json.loads(line)
         except (ValueError, RecursionError):
             continue
-        if isinstance(event, dict) and set(event) == fields:
+        if isinstance(event, dict) and set(event) == fields and _is_well_typed(event):
             events = [event] if event["kind"] == "start" else [*events, event]
     return events
+
+
+def _is_well_typed(event: dict[str, Any]) -> bool:
+    """The record may be a stranger's: texts are texts, and numbers are finite and no flags."""
+    texts = [event["kind"], event["message"], event["unit"] or ""]
+    numbers = [value for name, value in event.items() if name not in ("kind", "message", "unit")]
+    return all(isinstance(each, str) for each in texts) and all(
+        type(each) in (int, float) and abs(each) < 2**63 for each in numbers
+    )
 
 
 def _rate(events: list[dict[str, Any]]) -> float | None:

@@ -3,13 +3,15 @@
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import Field, field_validator, model_validator
 
-from tcmrl_data.canonical import canonical_json, digest, parse_json, sha256
+from tcmrl_data.canonical import MAX_JSON_BYTES, canonical_json, digest, parse_json, sha256
 from tcmrl_data.errors import ManifestError
-from tcmrl_data.recipe import Profile, Recipe, first_problem
+from tcmrl_data.plain_files import one_line, read_plain_file
+from tcmrl_data.recipe import Profile, Recipe
+from tcmrl_data.record import Record, validated
 
 SCHEMA_VERSION = 1
 """Raised when the meaning or the layout of a dataset's files changes."""
@@ -18,15 +20,27 @@ DATA_VERSION = 1
 """Raised by hand when the code's data change for the same recipe and seed."""
 
 MANIFEST = "manifest.json"
+PART_RECORD_BYTES = 2**20
 SHA256 = r"^[0-9a-f]{64}$"
-Record = TypeVar("Record", bound=BaseModel)
+MAX_INDEX = 2**31
+"""Bound of task indices and steps, which become folder names."""
+
+STANDARD_ARRAYS = {
+    "observations": ("float32", 2),
+    "actions": ("float32", 2),
+    "rewards": ("float32", 1),
+    "terminated": ("bool", 1),
+    "truncated": ("bool", 1),
+    "episode_offsets": ("int64", 1),
+}
+"""dtype and rank of the arrays of every part; an environment's extra arrays have rank 1."""
+
+MAX_ARRAYS = 32
+_ARRAY_NAME = r"[a-z0-9_]{1,64}"
+_FILE_NAME = rf"policy\.(json|safetensors)|zarr\.json|{_ARRAY_NAME}/(zarr\.json|c(/[0-9]{{1,9}}){{1,2}})"
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-
-class ArrayRecord(_Record):
+class ArrayRecord(Record):
     """dtype, shape and sha256 of an array's decoded bytes."""
 
     dtype: Literal["float32", "int64", "bool"]
@@ -34,14 +48,14 @@ class ArrayRecord(_Record):
     sha256: str = Field(pattern=SHA256)
 
 
-class FileRecord(_Record):
+class FileRecord(Record):
     """Size in bytes and sha256 of a file as it lies on disk."""
 
     size: int = Field(ge=0)
     sha256: str = Field(pattern=SHA256)
 
 
-class Identity(_Record):
+class Identity(Record):
     """What makes a part this part; its digest is the part's id.
 
     Attributes:
@@ -57,15 +71,35 @@ class Identity(_Record):
     schema_version: int
     data_version: int
     settings: dict[str, Any]
-    task: int = Field(ge=0)
+    task: int = Field(ge=0, lt=MAX_INDEX)
     parameters: dict[str, Any]
-    step: int = Field(ge=0)
+    step: int = Field(ge=0, lt=MAX_INDEX)
     seed: int = Field(ge=0)
     policy: str = Field(pattern=SHA256)
-    arrays: dict[str, ArrayRecord]
+    arrays: dict[str, ArrayRecord] = Field(max_length=MAX_ARRAYS)
+
+    @field_validator("arrays")
+    @classmethod
+    def _arrays_form_episodes(cls, arrays: dict[str, ArrayRecord]) -> dict[str, ArrayRecord]:
+        for name, (dtype, rank) in STANDARD_ARRAYS.items():
+            if name not in arrays:
+                raise ValueError(f"{name} is missing")
+            if (arrays[name].dtype, len(arrays[name].shape)) != (dtype, rank):
+                raise ValueError(f"{name} must be {dtype} of rank {rank}")
+        steps, episodes = arrays["actions"].shape[0], arrays["episode_offsets"].shape[0] - 1
+        rows = dict.fromkeys(arrays, steps)
+        rows |= {"observations": steps + episodes, "episode_offsets": episodes + 1}
+        for name, record in arrays.items():
+            if not re.fullmatch(_ARRAY_NAME, name):
+                raise ValueError(f"{name[:80]!r} is no array name")
+            if name not in STANDARD_ARRAYS and len(record.shape) != 1:
+                raise ValueError(f"{name} must be of rank 1")
+            if record.shape[0] != rows[name] or episodes < 1 or min(record.shape) < 0:
+                raise ValueError(f"{name}: shape {list(record.shape)} does not fit {steps} steps")
+        return arrays
 
 
-class Statistics(_Record):
+class Statistics(Record):
     """Undiscounted returns over a part's episodes, and moments that merge over parts.
 
     Attributes:
@@ -74,8 +108,8 @@ class Statistics(_Record):
         moments: array name to count, and per-column sums and sums of squares, in double precision.
     """
 
-    episodes: int
-    steps: int
+    episodes: int = Field(ge=0, lt=2**40)
+    steps: int = Field(ge=0, lt=2**40)
     mean: float
     std: float
     min: float
@@ -85,7 +119,7 @@ class Statistics(_Record):
     moments: dict[str, dict[str, Any]]
 
 
-class References(_Record):
+class References(Record):
     """Mean returns that results are held against, each over the recipe's number of episodes.
 
     Attributes:
@@ -99,7 +133,7 @@ class References(_Record):
     scripted: float | None
 
 
-class PartRecord(_Record):
+class PartRecord(Record):
     """`part.json`: identity, and beside it what may differ between two machines."""
 
     schema_version: int
@@ -111,19 +145,19 @@ class PartRecord(_Record):
     provenance: dict[str, Any]
 
 
-class TaskRecord(_Record):
+class TaskRecord(Record):
     """A task of the dataset."""
 
-    index: int = Field(ge=0)
+    index: int = Field(ge=0, lt=MAX_INDEX)
     split: Literal["train", "test"]
     parameters: dict[str, Any]
 
 
-class PartEntry(_Record):
+class PartEntry(Record):
     """A part as the manifest knows it; its folder follows from task and step."""
 
-    task: int = Field(ge=0)
-    step: int = Field(ge=0)
+    task: int = Field(ge=0, lt=MAX_INDEX)
+    step: int = Field(ge=0, lt=MAX_INDEX)
     id: str = Field(pattern=SHA256)
     sha256: str = Field(pattern=SHA256)
 
@@ -134,7 +168,7 @@ class TaskReferences(References):
     behavior: float
 
 
-class Manifest(_Record):
+class Manifest(Record):
     """`manifest.json`: everything a dataset holds.
 
     Attributes:
@@ -168,21 +202,31 @@ class Manifest(_Record):
         """Training defaults per profile."""
         return self.recipe.training
 
-    @field_validator("tasks")
-    @classmethod
-    def _tasks_are_sorted(cls, tasks: tuple[TaskRecord, ...]) -> tuple[TaskRecord, ...]:
-        indices = [task.index for task in tasks]
+    @model_validator(mode="after")
+    def _agrees_with_itself(self) -> "Manifest":
+        indices = [task.index for task in self.tasks]
+        keys = [(part.task, part.step) for part in self.parts]
         if indices != sorted(set(indices)):
             raise ValueError("tasks must be sorted by index, each once")
-        return tasks
-
-    @field_validator("parts")
-    @classmethod
-    def _parts_are_sorted(cls, parts: tuple[PartEntry, ...]) -> tuple[PartEntry, ...]:
-        keys = [(part.task, part.step) for part in parts]
+        if list(self.steps) != sorted(set(self.steps)):
+            raise ValueError("steps must rise")
         if keys != sorted(set(keys)):
             raise ValueError("parts must be sorted by task and step, each once")
-        return parts
+        missing = {"source", "observation", "reward", "settings"} - set(self.recipe.behavior)
+        if missing:
+            raise ValueError(f"recipe.behavior lacks {', '.join(sorted(missing))}")
+        if self.recipe.environment.get("name") != self.name:
+            raise ValueError("recipe.environment.name is not the manifest's name")
+        if self.root != merkle_root(self.parts):
+            raise ValueError("root does not match the parts")
+        tasks, steps = set(indices), set(self.steps)
+        if any(task not in tasks or step not in steps for task, step in keys):
+            raise ValueError("parts names a task or step that the dataset does not have")
+        if self.complete != (len(keys) == len(tasks) * len(steps)):
+            raise ValueError("complete does not agree with the parts")
+        if not set(self.references) <= set(map(str, tasks)):
+            raise ValueError("references names a task that the dataset does not have")
+        return self
 
 
 def merkle_root(parts: Iterable[PartEntry]) -> str:
@@ -208,21 +252,21 @@ def read_manifest(path: Path) -> Manifest:
         ManifestError: missing, truncated, edited, or of another schema version; names file and field.
     """
     file = path if path.name == MANIFEST else path / MANIFEST
-    if not file.is_file() or file.is_symlink():
+    try:
+        data = read_plain_file(file, limit=MAX_JSON_BYTES)
+        values = parse_json(data)
+    except (FileNotFoundError, NotADirectoryError):
         raise ManifestError(
             f"{file} does not exist; build a dataset with `tcmrl-data build ENV --out {file.parent}`"
-        )
-    data = file.read_bytes()
-    try:
-        values = parse_json(data)
-    except ValueError as error:
-        raise ManifestError(f"{file}: not a manifest ({error}); build again or restore the file") from None
-    manifest = _validated(Manifest, values, file)
+        ) from None
+    except (OSError, ValueError) as error:
+        raise ManifestError(
+            f"{file}: not a manifest ({one_line(error)}); build again or restore the file"
+        ) from None
+    manifest = validated(Manifest, values, file, version=SCHEMA_VERSION)
     fields = {key: value for key, value in values.items() if key != "digest"}
     if seal(fields) != data:
         raise ManifestError(f"{file}: digest does not match its contents; the file was edited or damaged")
-    if manifest.root != merkle_root(manifest.parts):
-        raise ManifestError(f"{file}: root does not match the parts")
     return manifest
 
 
@@ -232,30 +276,28 @@ def read_part_record(file: Path) -> PartRecord:
     Raises:
         ManifestError: names file and field.
     """
+    return read_sealed_part(file)[0]
+
+
+def read_sealed_part(file: Path) -> tuple[PartRecord, str]:
+    """A part's record and the sha256 of the very bytes that it was read from.
+
+    Raises:
+        ManifestError: names file and field.
+    """
     try:
-        values = parse_json(file.read_bytes())
+        data = read_plain_file(file, limit=PART_RECORD_BYTES)
+        values = parse_json(data)
+    except FileNotFoundError:
+        raise ManifestError(f"{file} is missing; run `tcmrl-data repair`") from None
     except (OSError, ValueError) as error:
         raise ManifestError(
-            f"{file}: not a part record ({error}); delete its folder and build again"
+            f"{file}: not a part record ({one_line(error)}); run `tcmrl-data repair`"
         ) from None
-    record = _validated(PartRecord, values, file)
+    record = validated(PartRecord, values, file, version=SCHEMA_VERSION)
     if record.id != digest(values["identity"]):
-        raise ManifestError(
-            f"{file}: id is not the digest of its identity; delete its folder and build again"
-        )
+        raise ManifestError(f"{file}: id is not the digest of its identity; run `tcmrl-data repair`")
     for name in record.files:
-        if not re.fullmatch(r"[a-z0-9_]{1,64}(\.[a-z]{1,16})?(/c(/\d{1,9}){1,2}|/zarr\.json)?", name):
+        if not re.fullmatch(_FILE_NAME, name):
             raise ManifestError(f"{file}: files names {name[:80]!r}, which no part has")
-    return record
-
-
-def _validated(kind: type[Record], values: Any, file: Path) -> Record:
-    version = values.get("schema_version") if isinstance(values, dict) else None
-    if version != SCHEMA_VERSION:
-        raise ManifestError(
-            f"{file}: schema_version {version!r} is not {SCHEMA_VERSION}, which this version reads"
-        )
-    try:
-        return kind.model_validate_json(canonical_json(values))
-    except ValidationError as error:
-        raise ManifestError(f"{file}: {first_problem(error)}") from None
+    return record, sha256(data)

@@ -13,6 +13,8 @@ from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 from tcmrl_data.canonical import canonical_json, digest, parse_json, sha256
 from tcmrl_data.environment import Controller, Environment, Parameters, View
 from tcmrl_data.errors import SnapshotError
+from tcmrl_data.plain_files import one_line, printable, read_plain_file
+from tcmrl_data.publish import make_folders, write_tree
 from tcmrl_data.trajectory import FloatArray
 
 if TYPE_CHECKING:
@@ -21,6 +23,11 @@ if TYPE_CHECKING:
 
 LOG_STD_RANGE = (-20.0, 2.0)
 """Clamp of the log standard deviation in Stable-Baselines3's SAC actor."""
+
+
+DESCRIPTION_BYTES = 2**16
+HEADER_BYTES = 2**16
+"""Most that `policy.json`, and the header of `policy.safetensors`, may take."""
 
 
 class _Description(BaseModel):
@@ -35,7 +42,7 @@ class GaussianPolicy(_Description):
     kind: Literal["squashed_gaussian"] = "squashed_gaussian"
     observation_dim: int = Field(ge=1, le=2**16)
     action_dim: int = Field(ge=1, le=2**16)
-    hidden: tuple[Annotated[int, Field(ge=1, le=2**16)], ...]
+    hidden: tuple[Annotated[int, Field(ge=1, le=2**16)], ...] = Field(max_length=16)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
         """Name and shape of every tensor."""
@@ -51,7 +58,7 @@ class ScriptedPolicy(_Description):
     """The environment's own expert plus N(0, noise) on every action."""
 
     kind: Literal["scripted"] = "scripted"
-    noise: float = Field(ge=0, le=10)
+    noise: float = Field(ge=0, le=10, allow_inf_nan=False)
 
 
 PolicyDescription = Annotated[GaussianPolicy | ScriptedPolicy, Field(discriminator="kind")]
@@ -111,11 +118,11 @@ def read_snapshot(folder: Path, step: int) -> Snapshot:
             description asks for, or weights that are not finite.
     """
     try:
-        values = parse_json((folder / "policy.json").read_bytes())
+        values = parse_json(read_plain_file(folder / "policy.json", limit=DESCRIPTION_BYTES))
         description = _DESCRIPTION.validate_json(canonical_json(values))
     except (OSError, ValueError, ValidationError) as error:
         raise SnapshotError(
-            f"{folder / 'policy.json'}: not a policy description ({_one_line(error)})"
+            f"{folder / 'policy.json'}: not a policy description ({one_line(error)})"
         ) from None
     if isinstance(description, ScriptedPolicy):
         return Snapshot(step, description)
@@ -128,22 +135,20 @@ def _read_tensors(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str
 
     weights = sum(int(np.prod(shape)) for shape in shapes.values())
     try:
-        if file.stat().st_size > 4 * weights + 2**16:
-            raise SnapshotError(f"{file}: {file.stat().st_size} bytes, the policy needs {4 * weights}")
-        tensors = load(file.read_bytes())
-    except (OSError, SafetensorError) as error:
-        raise SnapshotError(f"{file}: cannot be read as safetensors ({_one_line(error)})") from None
+        data = read_plain_file(file, limit=4 * weights + HEADER_BYTES)
+        if len(data) < 4 * weights:
+            raise SnapshotError(f"{file}: {len(data)} bytes, the policy needs {4 * weights}")
+        tensors = load(data)
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+        raise SnapshotError(f"{file}: cannot be read as safetensors ({one_line(error)})") from None
     found = {name: array.shape for name, array in tensors.items()}
     if found != dict(shapes):
-        raise SnapshotError(f"{file}: tensors {sorted(found)} do not have the policy's names and shapes")
+        names = printable(str(sorted(found)))[:200]
+        raise SnapshotError(f"{file}: tensors {names} do not have the policy's names and shapes")
     for name, array in tensors.items():
         if array.dtype != np.float32 or not np.isfinite(array).all():
             raise SnapshotError(f"{file}: tensor {name!r} must be finite float32")
     return tensors
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())[:200]
 
 
 def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
@@ -166,6 +171,54 @@ def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
         hidden=tuple(tensors[f"hidden.{i}.bias"].size for i in range(len(layers))),
     )
     return Snapshot(step, description, tensors)
+
+
+def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
+    """Takes the actor out of a Stable-Baselines3 zip into a new folder, `policy.json` and its weights.
+
+    The zip holds pickles: reading it runs whatever code its author put there. Only an explicit command
+    calls this, never anything that opens a dataset.
+
+    Args:
+        file: what `SAC.save` wrote.
+        out: folder to make.
+        observation: the view that the policy was trained with.
+
+    Raises:
+        SnapshotError: no SAC with ReLU layers in the file, or the folder exists.
+        StorageError: the disk refuses.
+    """
+    import pickle
+    import zipfile
+
+    from stable_baselines3 import SAC
+    from torch.nn import ReLU
+
+    if out.exists():
+        raise SnapshotError(f"{out} exists; choose another folder")
+    try:
+        model = SAC.load(file, device="cpu")
+        layers = list(model.policy.actor.latent_pi)
+        if not all(isinstance(layer, ReLU) for layer in layers[1::2]):
+            raise SnapshotError(f"{file}: only policies with ReLU layers can be imported")
+        snapshot = snapshot_of_sac(model, step=model.num_timesteps, observation=observation)
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        AssertionError,
+        ImportError,
+        RuntimeError,
+        EOFError,
+        pickle.UnpicklingError,
+        zipfile.BadZipFile,
+    ) as error:
+        raise SnapshotError(f"{file}: holds no SAC of Stable-Baselines3 ({one_line(error)})") from None
+    make_folders(out.parent)
+    write_tree(out, snapshot.files())
+    return snapshot
 
 
 @final

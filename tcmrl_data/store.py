@@ -7,17 +7,17 @@ next observations are never stored twice.
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import pairwise, product
-from math import ceil, prod
+from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from tcmrl_data.canonical import canonical_json, parse_json, sha256
+from tcmrl_data.canonical import sha256
 from tcmrl_data.errors import StoreError
+from tcmrl_data.layout import ArrayLayout, check_expansion, chunk_problem, read_layout
+from tcmrl_data.plain_files import one_line, read_plain_file
 from tcmrl_data.trajectory import Trajectory
 
 Arrays = Mapping[str, npt.NDArray[Any]]
@@ -26,15 +26,6 @@ CHUNK_BYTES = 16 * 10**6
 """An array stays one chunk below this size (16 MB); above it, chunks are blocks of rows."""
 
 STEP_ARRAYS = ("actions", "rewards", "terminated", "truncated")
-METADATA_BYTES = 2**16
-MAX_CHUNKS = 10**6
-GROUP = canonical_json({"zarr_format": 3, "node_type": "group", "attributes": {}})
-_CODECS = (
-    {"name": "bytes", "configuration": {"endian": "little"}},
-    {"name": "zstd", "configuration": {"level": 3, "checksum": False}},
-    {"name": "crc32c"},
-)
-_ONE_BYTE_CODECS = ({"name": "bytes"}, *_CODECS[1:])
 
 
 def pack(trajectories: Sequence[Trajectory]) -> dict[str, npt.NDArray[Any]]:
@@ -61,7 +52,12 @@ def unpack(arrays: Arrays) -> list[Trajectory]:
     """
     offsets = arrays["episode_offsets"]
     steps = len(arrays["actions"])
-    if len(offsets) < 1 or offsets[0] != 0 or offsets[-1] != steps or np.any(np.diff(offsets) < 0):
+    if (
+        len(offsets) < 1
+        or offsets[0] != 0
+        or offsets[-1] != steps
+        or np.any(offsets[1:] < offsets[:-1])  # a difference of two int64 may wrap around
+    ):
         raise StoreError(f"episode_offsets must rise from 0 to {steps}, got {offsets[:3]} … {offsets[-1:]}")
     extras = [name for name in arrays if name not in {*STEP_ARRAYS, "observations", "episode_offsets"}]
     return [
@@ -105,27 +101,17 @@ def encode_arrays(arrays: Arrays) -> dict[str, bytes]:
 
 
 def read_arrays(folder: Path, names: Iterable[str]) -> dict[str, npt.NDArray[Any]]:
-    """Decodes arrays of a part.
+    """Decodes arrays of a part; zarr sees copies of checked files in memory, never the disk.
 
     Raises:
-        StoreError: a `zarr.json` outside the allow-list, a missing chunk, or bytes that do not decode.
+        StoreError: a `zarr.json` outside the allow-list, a missing chunk, arrays larger than their files
+            justify, or bytes that do not decode.
     """
-    import zarr
-
-    result = {}
-    for name in names:
-        for file in array_files(folder, name):
-            if not (folder / file).is_file():
-                raise StoreError(f"{folder / file} is missing; rebuild the part")
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")
-            try:
-                array = zarr.open_array(folder / name, mode="r", zarr_format=3)
-                result[name] = np.asarray(array[...])
-            except (ValueError, RuntimeError, OSError, TypeError, KeyError) as error:
-                reason = " ".join(str(error).split())[:200]
-                raise StoreError(f"{folder / name} does not decode ({reason}); rebuild the part") from None
-    return result
+    layouts = [read_layout(folder, name) for name in names]
+    files = {layout.name: _read_files(folder, layout) for layout in layouts}
+    stored = sum(len(data) for each in files.values() for data in each.values())
+    check_expansion(layouts, stored, folder)
+    return {layout.name: _decode(folder, layout.name, files.pop(layout.name)) for layout in layouts}
 
 
 def array_files(folder: Path, name: str) -> list[str]:
@@ -134,12 +120,40 @@ def array_files(folder: Path, name: str) -> list[str]:
     Raises:
         StoreError: the `zarr.json` is missing or outside the allow-list.
     """
-    metadata = _read_metadata(_ArrayMetadata, folder / name / "zarr.json")
-    grid = [range(ceil(size / chunk)) for size, chunk in zip(metadata.shape, metadata.chunks, strict=True)]
-    if prod(len(axis) for axis in grid) > MAX_CHUNKS:
-        raise StoreError(f"{folder / name / 'zarr.json'}: more than {MAX_CHUNKS} chunks")
-    chunk_files = ["/".join(map(str, ("c", *index))) for index in product(*grid)]
-    return [f"{name}/{file}" for file in ("zarr.json", *chunk_files)]
+    return read_layout(folder, name).files()
+
+
+def _read_files(folder: Path, layout: ArrayLayout) -> dict[str, bytes]:
+    """The content of an array's files, chunks checked to be of their declared size."""
+    limit = 2**16 + layout.chunk_bytes + layout.chunk_bytes // 64
+    contents = {}
+    for name in layout.files():
+        try:
+            contents[name] = data = read_plain_file(folder / name, limit=limit)
+        except FileNotFoundError:
+            raise StoreError(f"{folder / name} is missing; run `tcmrl-data repair`") from None
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{folder / name}: {one_line(error)}") from None
+        problem = None if name.endswith("zarr.json") else chunk_problem(layout, data)
+        if problem:
+            raise StoreError(f"{folder / name} {problem}; run `tcmrl-data repair`")
+    return contents
+
+
+def _decode(folder: Path, name: str, files: Mapping[str, bytes]) -> npt.NDArray[Any]:
+    import zarr
+    from zarr.buffer import cpu
+    from zarr.storage import MemoryStore
+
+    store = MemoryStore({path: cpu.Buffer.from_bytes(data) for path, data in files.items()})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        try:
+            return np.asarray(zarr.open_array(store, path=name, mode="r", zarr_format=3)[...])
+        except (ValueError, RuntimeError, OSError, TypeError, KeyError) as error:
+            raise StoreError(
+                f"{folder / name} does not decode ({one_line(error)}); run `tcmrl-data repair`"
+            ) from None
 
 
 def array_digests(arrays: Arrays) -> dict[str, dict[str, Any]]:
@@ -152,91 +166,3 @@ def array_digests(arrays: Arrays) -> dict[str, dict[str, Any]]:
         }
         for name, array in arrays.items()
     }
-
-
-def check_layout(folder: Path, arrays: Mapping[str, Mapping[str, Any]]) -> None:
-    """Checks a part's `zarr.json` files against the allow-list and the part's own record.
-
-    Args:
-        folder: the part.
-        arrays: name to `{"dtype", "shape", …}`, as the part's record has them.
-
-    Raises:
-        StoreError: names the file and the field.
-    """
-    _read_metadata(_GroupMetadata, folder / "zarr.json")
-    for name, record in arrays.items():
-        file = folder / name / "zarr.json"
-        metadata = _read_metadata(_ArrayMetadata, file)
-        if metadata.data_type != record["dtype"] or list(metadata.shape) != list(record["shape"]):
-            raise StoreError(
-                f"{file}: {metadata.data_type}{list(metadata.shape)} is not what part.json records, "
-                f"{record['dtype']}{list(record['shape'])}"
-            )
-
-
-class _Metadata(BaseModel):
-    """What every `zarr.json` of a part may say."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    zarr_format: Literal[3]
-    attributes: dict[str, Any] = Field(default={}, max_length=0)
-
-
-class _GroupMetadata(_Metadata):
-    node_type: Literal["group"]
-
-
-class _ChunkShape(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    chunk_shape: tuple[Annotated[int, Field(ge=1, lt=2**40)], ...]
-
-
-class _ChunkGrid(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    name: Literal["regular"]
-    configuration: _ChunkShape
-
-
-class _ArrayMetadata(_Metadata):
-    node_type: Literal["array"]
-    data_type: Literal["float32", "int64", "bool"]
-    shape: tuple[Annotated[int, Field(ge=0, lt=2**40)], ...] = Field(min_length=1, max_length=2)
-    chunk_grid: _ChunkGrid
-    chunk_key_encoding: dict[str, Any]
-    codecs: tuple[dict[str, Any], ...]
-    fill_value: str | float | bool
-    storage_transformers: tuple[Any, ...] = Field(default=(), max_length=0)
-
-    @property
-    def chunks(self) -> tuple[int, ...]:
-        return self.chunk_grid.configuration.chunk_shape
-
-    @model_validator(mode="after")
-    def _as_written_here(self) -> "_ArrayMetadata":
-        if len(self.chunks) != len(self.shape):
-            raise ValueError(f"chunk_grid {self.chunks} does not fit shape {self.shape}")
-        if self.chunk_key_encoding != {"name": "default", "configuration": {"separator": "/"}}:
-            raise ValueError(f"chunk_key_encoding {self.chunk_key_encoding} is not allowed")
-        if self.codecs not in (_CODECS, _ONE_BYTE_CODECS):
-            raise ValueError(f"codecs {str(self.codecs)[:200]} are not allowed")
-        return self
-
-
-Metadata = TypeVar("Metadata", bound=_Metadata)
-
-
-def _read_metadata(kind: type[Metadata], file: Path) -> Metadata:
-    try:
-        if file.stat().st_size > METADATA_BYTES:
-            raise StoreError(f"{file}: larger than any zarr.json of a part")
-        return kind.model_validate_json(canonical_json(parse_json(file.read_bytes())))
-    except ValidationError as error:
-        detail = error.errors()[0]
-        field = ".".join(map(str, detail["loc"])) or "values"
-        raise StoreError(f"{file}: {field}: {detail['msg']}") from None
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{file}: not readable as zarr.json ({error})") from None

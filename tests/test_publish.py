@@ -14,9 +14,9 @@ import pytest
 from tcmrl_data import Dataset, Recipe, build, open_dataset, publish
 from tcmrl_data.driver import check_part
 from tcmrl_data.errors import LockedError, StorageError, TcmrlError
+from tcmrl_data.layout import GROUP
 from tcmrl_data.manifest import part_folder, read_manifest
 from tcmrl_data.publish import LOCK, STAGING, lock_file, lock_holder, publish_folder, remove_abandoned
-from tcmrl_data.store import GROUP
 from tests.simulated_disk import (
     FAULTS,
     Fault,

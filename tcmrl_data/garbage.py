@@ -1,0 +1,103 @@
+"""What an ended build may leave behind and nobody needs: abandoned staging, checkpoints of finished tasks."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from tcmrl_data.errors import BuildError, LockedError
+from tcmrl_data.manifest import MANIFEST, read_manifest
+from tcmrl_data.publish import (
+    CHECKPOINTS,
+    LOCK,
+    STAGING,
+    lock_file,
+    lock_holder,
+    remove_abandoned,
+    remove_tree,
+)
+from tcmrl_data.repair import REPAIR
+from tcmrl_data.scan import check_work_files
+
+CHECKPOINT = re.compile(r"task_([0-9]{5,10})")
+
+
+@dataclass(frozen=True)
+class Garbage:
+    """One thing to remove.
+
+    Attributes:
+        path: relative to the dataset.
+        reason: why nobody needs it.
+        bytes: of all files in it.
+    """
+
+    path: str
+    reason: str
+    bytes: int
+
+
+def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage, ...]:
+    """Removes abandoned staging and checkpoints of tasks whose parts are all published.
+
+    Args:
+        path: the dataset's folder or its `manifest.json`.
+        dry_run: only say what would be removed; changes nothing.
+
+    Raises:
+        BuildError: there is no dataset at the path, or its work folders are links.
+        LockedError: a process works on the dataset; names it.
+        ManifestError: the manifest is damaged, so that nobody knows which tasks are finished.
+    """
+    folder = Path(path).parent if Path(path).name == MANIFEST else Path(path)
+    if not any((folder / name).exists() for name in (MANIFEST, LOCK, STAGING)):
+        raise BuildError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
+    check_work_files(folder)
+    holder = lock_holder(folder / LOCK)
+    if holder is not None:
+        raise LockedError(f"dataset {folder} is being written by {holder}; wait for it or stop it")
+    if dry_run:
+        return _garbage(folder)
+    with lock_file(folder / LOCK, f"dataset {folder}"):
+        found = _garbage(folder)
+        remove_abandoned(folder)
+        for each in found:
+            if each.path.startswith(CHECKPOINTS) or each.path == f"{STAGING}/{REPAIR}":
+                remove_tree(folder / each.path)
+    return found
+
+
+def _garbage(folder: Path) -> tuple[Garbage, ...]:
+    staging, checkpoints = folder / STAGING, folder / CHECKPOINTS
+    found = []
+    for each in sorted(staging.iterdir()) if staging.is_dir() else []:
+        lock = each.with_name(f"{each.name}.lock")
+        if each.suffix == ".lock":
+            is_abandoned = lock_holder(each) is None and not each.with_suffix("").exists()
+        elif each.is_dir():
+            is_abandoned = each.name == REPAIR or (lock.exists() and lock_holder(lock) is None)
+        else:
+            is_abandoned = True
+        if is_abandoned:
+            found.append(Garbage(f"{STAGING}/{each.name}", "abandoned by a build that ended", _size(each)))
+    finished = _finished_tasks(folder)
+    for each in sorted(checkpoints.iterdir()) if checkpoints.is_dir() else []:
+        match = CHECKPOINT.fullmatch(each.name)
+        if match and int(match[1]) in finished:
+            found.append(Garbage(f"{CHECKPOINTS}/{each.name}", f"task {int(match[1])} is done", _size(each)))
+    return tuple(found)
+
+
+def _finished_tasks(folder: Path) -> set[int]:
+    """Tasks with every part in the manifest; none where there is no manifest yet."""
+    if not (folder / MANIFEST).exists():
+        return set()
+    manifest = read_manifest(folder)
+    counts: dict[int, int] = {}
+    for entry in manifest.parts:
+        counts[entry.task] = counts.get(entry.task, 0) + 1
+    return {task for task, count in counts.items() if count == len(manifest.steps)}
+
+
+def _size(path: Path) -> int:
+    files = [path, *path.rglob("*")] if path.is_dir() and not path.is_symlink() else [path]
+    return sum(each.lstat().st_size for each in files if not each.is_dir())

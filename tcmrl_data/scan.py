@@ -1,0 +1,83 @@
+"""A list of everything that lies in a dataset's folder, without following a link or opening a file."""
+
+import os
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from tcmrl_data.errors import BuildError
+from tcmrl_data.events import EVENTS
+from tcmrl_data.plain_files import file_problem, one_line
+from tcmrl_data.publish import CHECKPOINTS, LOCK, STAGING
+
+WORK_FOLDERS = {STAGING, CHECKPOINTS}
+WORK_FILES = {LOCK, EVENTS}
+"""What a build keeps beside the data: only its kind is looked at."""
+
+MAX_DEPTH = 10
+"""A part's chunks lie 8 folders deep."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What lies in a folder, by relative path.
+
+    Attributes:
+        files: `lstat` of everything that is no folder.
+        empty_folders: folders that hold nothing.
+        problems: folders that could not be listed, or lie too deep, and why.
+    """
+
+    files: dict[str, os.stat_result]
+    empty_folders: set[str]
+    problems: dict[str, str]
+
+    def paths(self) -> Iterator[str]:
+        """Every path found, in no order."""
+        yield from self.files
+        yield from self.empty_folders
+        yield from self.problems
+
+
+def scan_dataset(folder: Path) -> Scan:
+    """Lists a dataset, work files left out where they are of their kind."""
+    scan = Scan({}, set(), {})
+    waiting = [""]
+    while waiting:
+        place = waiting.pop()
+        try:
+            with os.scandir(folder / place) as found:
+                entries = list(found)
+        except OSError as error:
+            scan.problems[place or "."] = f"cannot be listed ({one_line(error)})"
+            continue
+        if not entries and place:
+            scan.empty_folders.add(place)
+        for entry in entries:
+            path = f"{place}/{entry.name}" if place else entry.name
+            status = entry.stat(follow_symlinks=False)
+            is_folder = stat.S_ISDIR(status.st_mode)
+            if is_folder and path.count("/") >= MAX_DEPTH:
+                scan.problems[path] = "lies deeper than any folder of a dataset"
+            elif is_folder and path not in WORK_FOLDERS:
+                waiting.append(path)
+            elif not is_folder and not (path in WORK_FILES and stat.S_ISREG(status.st_mode)):
+                scan.files[path] = status
+    return scan
+
+
+def check_work_files(folder: Path) -> None:
+    """Refuses a dataset whose work files or folders are links, which would lead writing out of it.
+
+    Raises:
+        BuildError: names the file.
+    """
+    for name in sorted(WORK_FILES | WORK_FOLDERS | {"tasks"}):
+        try:
+            status = (folder / name).lstat()
+        except FileNotFoundError:
+            continue
+        is_folder = stat.S_ISDIR(status.st_mode)
+        if (name in WORK_FILES and file_problem(status)) or (name not in WORK_FILES and not is_folder):
+            raise BuildError(f"{folder / name} is not the plain file or folder that a build makes; delete it")
