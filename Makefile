@@ -17,22 +17,22 @@ export MPLBACKEND ?= Agg
 .PHONY: demo test check format clean
 
 $(BIN)/python:
-	$(PYTHON) -c "import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), 'Python 3.11 to 3.13 needed: make PYTHON=python3.11'"
+	@$(PYTHON) -c "import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), 'Python 3.11 to 3.13 needed: make PYTHON=python3.11'"
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
 	$(BIN)/python -m pip install --quiet -c constraints.txt --editable .
-	touch $@
+	@touch $@
 
 $(INSTALLED_TEST): $(INSTALLED)
-	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[test]'
-	touch $@
+	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[ray,test]'
+	@touch $@
 
 demo: $(INSTALLED)
 	$(BIN)/tcmrl-data build point-robot --profile quick --seed $(SEED) --out $(DATA)
 	$(BIN)/tcmrl-data inspect returns $(DATA) --plot $(DATA)-returns.png
-	rm -rf $(RUN)
+	@rm -rf $(RUN)
 	$(BIN)/tcmrl train $(DATA) --seed $(SEED) --out $(RUN)
 	$(BIN)/tcmrl evaluate $(RUN) --protocol all
 

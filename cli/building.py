@@ -1,8 +1,11 @@
 """`tcmrl-data plan` and `build`: from a recipe to a dataset."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable
+import signal
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -16,6 +19,7 @@ from .frame import (
     print_table,
     remark,
     size,
+    typed_command,
 )
 from .progress import StageProgress
 
@@ -57,7 +61,11 @@ def recipe_options(command: Command) -> Command:
             "--workers", type=click.IntRange(min=1), help="Processes at a time; all cores if left out."
         ),
         click.option(
-            "--engine", default="local", show_default=True, metavar="NAME", help="Where the work runs: local."
+            "--engine",
+            default="local",
+            show_default=True,
+            metavar="NAME",
+            help="Where the work runs: local, or ray (needs tcmrl[ray]).",
         ),
         output_options,
     )
@@ -127,6 +135,11 @@ def plan(
     show_default=True,
     help="Seeds behavior training and rollouts; tasks and split do not depend on it.",
 )
+@click.option(
+    "--ray-address",
+    metavar="ADDRESS",
+    help="A running Ray cluster that shares the dataset's folder; one is started here if left out.",
+)
 def build(
     environment: str,
     profile: str,
@@ -139,6 +152,7 @@ def build(
     quiet: bool,
     out: Path | None,
     seed: int,
+    ray_address: str | None,
 ) -> None:
     """Build a dataset of ENV, or what is missing of one.
 
@@ -155,14 +169,16 @@ def build(
 
     recipe = _load(environment, profile, behavior, overrides)
     chosen = _parse_tasks(recipe, tasks)
-    with StageProgress(quiet=quiet) as progress:
+    out = out or Path("data") / environment
+    with _stopped_by_signals(out), StageProgress(quiet=quiet) as progress:
         report = tcmrl_data.build_dataset(
             recipe,
-            out or Path("data") / environment,
+            out,
             seed=seed,
             tasks=chosen,
             workers=workers,
             engine=engine,
+            address=ray_address,
             progress=lambda event: _show(event, progress),
         )
     if as_json:
@@ -175,6 +191,22 @@ def build(
     if report.failed:
         more = "" if len(report.failed) == 1 else f" (and {len(report.failed) - 1} more)"
         fail_incomplete(f"{report.failed[0]}{more}; the same command tries again what is missing")
+
+
+@contextlib.contextmanager
+def _stopped_by_signals(out: Path) -> Iterator[None]:
+    """Lets Ctrl-C and SIGTERM end a build in order, with one line that says how to go on."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    earlier = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    except KeyboardInterrupt:
+        fail_incomplete(f"interrupted; {out} keeps what is finished, to go on run `{typed_command()}` again")
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
 
 
 def _load(environment: str, profile: str, behavior: str | None, overrides: tuple[str, ...]) -> "Recipe":

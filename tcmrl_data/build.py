@@ -1,6 +1,5 @@
 """Building a dataset: choose tasks, refuse what cannot work, run units on an engine, keep what is done."""
 
-import os
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -50,6 +49,7 @@ def build_dataset(
     tasks: Sequence[int] | None = None,
     workers: int | None = None,
     engine: str = "local",
+    address: str | None = None,
     progress: Callable[[BuildEvent], None] = lambda event: None,
 ) -> BuildReport:
     """Builds what is missing of a dataset; on a finished one it verifies and changes nothing.
@@ -59,8 +59,9 @@ def build_dataset(
         out: dataset folder: new, empty, or a dataset of the same recipe and seed, which is extended.
         seed: root seed of behavior training and rollouts.
         tasks: indices of the full task set instead of the profile's choice.
-        workers: units run at the same time; the number of cores where None.
+        workers: units run at the same time; as many as the engine has cores where None.
         engine: an engine's name.
+        address: of the engine's cluster, where it has one.
         progress: called as the build goes on.
 
     Raises:
@@ -70,7 +71,7 @@ def build_dataset(
         StorageError: too little free space, or the disk refused; what was published stands.
     """
     started = time.monotonic()
-    runner: BaseEngine = plugin("tcmrl_data.engine", "engine", engine).Engine(workers or os.cpu_count() or 1)
+    runner: BaseEngine = plugin("tcmrl_data.engine", "engine", engine).Engine(workers, address=address)
     chosen = choose_tasks(recipe, tasks)
     _check_folder(out, recipe, seed)
     make_folders(out)

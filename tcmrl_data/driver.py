@@ -25,7 +25,6 @@ from tcmrl_data.manifest import (
 )
 from tcmrl_data.publish import STAGING, make_folders, replace_file
 from tcmrl_data.recipe import Recipe
-from tcmrl_data.store import GROUP, check_layout
 from tcmrl_data.tasks import Task
 from tcmrl_data.unit import UnitSpec, behavior_source
 
@@ -71,6 +70,7 @@ class Driver:
             results = engine.run(units, lambda unit, message: self._on_message(unit, message, log))
             with contextlib.closing(results):
                 for result in results:
+                    self._take_in_published(result.id)
                     if result.ok:
                         log.write(self._event("unit_done", f"{result.id} done", result.id))
                     else:
@@ -83,7 +83,16 @@ class Driver:
 
     def _unit(self, task: Task) -> Unit:
         spec = UnitSpec(self._out.resolve(), self._recipe, self._seed, (task,))
-        return Unit(f"task {task.index}", spec.to_json(), cost=self._source.training_steps)
+        asked = self._recipe.build
+        return Unit(
+            _unit_id(task.index),
+            spec.to_json(),
+            cost=self._source.training_steps,
+            cpus=asked.cpus,
+            gpus=asked.gpus,
+            memory=asked.memory,
+            timeout=asked.timeout,
+        )
 
     def _is_done(self, index: int) -> bool:
         return all((index, step) in self.parts for step in self._source.steps)
@@ -97,6 +106,14 @@ class Driver:
         if time.monotonic() - self._written > MANIFEST_SECONDS:
             self.write_manifest()
         log.write(self._event("part", f"{unit}, step {message['step']}", unit))
+
+    def _take_in_published(self, unit: str) -> None:
+        """Takes in a unit's parts whose messages were lost, with the worker that published them."""
+        index = next(index for index in self._tasks if unit == _unit_id(index))
+        for step in self._source.steps:
+            known = (index, step) in self.parts
+            if not known and (self._out / part_folder(index, step) / "part.json").is_file():
+                self._take_in(index, step)
 
     def _take_in(self, task: int, step: int) -> None:
         """Checks a published part by its digests and adds it to the manifest."""
@@ -168,6 +185,10 @@ def check_part(folder: Path) -> PartRecord:
         if not file.is_file() or file.is_symlink() or sha256(file.read_bytes()) != expected.sha256:
             raise StoreError(f"{file} is missing or damaged; run `tcmrl-data repair`")
     return record
+
+
+def _unit_id(task: int) -> str:
+    return f"task {task}"
 
 
 def _failure(result: Result) -> str:

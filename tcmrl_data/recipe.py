@@ -52,10 +52,23 @@ class Rollouts(_Table):
 
 
 class TaskChoice(_Table):
-    """The `[build]` table: how many tasks of each split, evenly spaced; all where unset."""
+    """The `[build]` table: which tasks, and what each takes; no part of any digest.
+
+    Attributes:
+        train_tasks: how many, evenly spaced; all where unset.
+        test_tasks: how many, evenly spaced; all where unset.
+        cpus: cores that a cluster reserves for a task.
+        gpus: graphics processors that a cluster reserves for a task; a fraction shares one.
+        memory: bytes that a cluster reserves for a task.
+        timeout: seconds after which an attempt at a task is ended; no limit where unset.
+    """
 
     train_tasks: int | None = Field(default=None, ge=2)
     test_tasks: int | None = Field(default=None, ge=1)
+    cpus: float = Field(default=1.0, gt=0)
+    gpus: float = Field(default=0.0, ge=0)
+    memory: int = Field(default=0, ge=0)
+    timeout: float | None = Field(default=None, gt=0)
 
 
 class Recipe(_Table):

@@ -1,13 +1,17 @@
 """Shared fixtures: one real, tiny dataset, built once per session with the real libraries."""
 
 import shutil
-from collections.abc import Callable
+import uuid
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe
+from tests.namespace import has_only_loopback
+from tests.workers import MARK
 
 TASKS = [0, 3, 40, 60, 99]
 TINY = (
@@ -20,9 +24,26 @@ TINY = (
     "rollouts.lanes=3",
 )
 
+QUICK_TO_NOTICE = {
+    "RAY_USAGE_STATS_ENABLED": "0",
+    "RAY_health_check_period_ms": "500",
+    "RAY_health_check_timeout_ms": "500",
+    "RAY_health_check_failure_threshold": "4",
+}
+"""Settings of Ray under which the loss of a machine is noticed in seconds."""
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--sweep", type=int, default=40, help="try every n-th case of the exhaustive sweeps")
+    parser.addoption("--tiny", type=Path, help="the tiny dataset, if it was made before")
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leaves tests that need a network of their own to tests/test_namespace.py, which makes one."""
+    if not has_only_loopback():
+        elsewhere = [item for item in items if item.get_closest_marker("loopback")]
+        items[:] = [item for item in items if item not in elsewhere]
+        config.hook.pytest_deselected(items=elsewhere)
 
 
 @pytest.fixture
@@ -33,13 +54,44 @@ def sweep(request: pytest.FixtureRequest) -> int:
 
 
 @pytest.fixture(scope="session")
+def mark() -> Iterator[str]:
+    """Stands in the environment of every process that this session starts."""
+    value = uuid.uuid4().hex
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(MARK, value)
+        yield value
+
+
+@pytest.fixture(scope="session")
+def ray_cluster(mark: str) -> Iterator[Any]:
+    """A Ray cluster of one machine with four cores; machines may be added, and removed again."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in QUICK_TO_NOTICE.items():
+            patch.setenv(name, value)
+        import ray
+        from ray.cluster_utils import Cluster
+
+        cluster = Cluster(
+            initialize_head=True, connect=True, head_node_args={"num_cpus": 4, "include_dashboard": False}
+        )
+        yield cluster
+        ray.shutdown()
+        cluster.shutdown()
+
+
+@pytest.fixture(scope="session")
 def tiny_recipe() -> Recipe:
     return tcmrl_data.load_recipe("point-robot", profile="quick", overrides=TINY)
 
 
 @pytest.fixture(scope="session")
-def tiny_folder(tmp_path_factory: pytest.TempPathFactory, tiny_recipe: Recipe) -> Path:
+def tiny_folder(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, tiny_recipe: Recipe
+) -> Path:
     """Folder of the tiny dataset: five tasks (one of them test), three snapshots, six episodes each."""
+    made_before: Path | None = request.config.getoption("--tiny")
+    if made_before is not None:
+        return made_before
     folder = tmp_path_factory.mktemp("datasets") / "tiny"
     report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS, workers=2)
     assert (report.failed, report.built) == ((), len(TASKS) * 3)

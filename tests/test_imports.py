@@ -104,8 +104,9 @@ def test_every_package_of_the_tree_is_installed() -> None:
 
 def test_every_dependency_is_pinned_and_explained() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    wanted = project["dependencies"] + project["optional-dependencies"]["test"]
-    names = {text.partition(">")[0].lower() for text in wanted}
+    extras = project["optional-dependencies"].values()
+    wanted = [project["dependencies"], *extras]
+    names = {text.partition(">")[0].lower() for texts in wanted for text in texts}
     pins = (ROOT / "constraints.txt").read_text(encoding="utf-8").splitlines()
     pinned = {line.partition("==")[0].lower().replace("_", "-") for line in pins if "==" in line}
     assert names <= pinned

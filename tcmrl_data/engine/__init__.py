@@ -1,12 +1,17 @@
-"""Engines run units somewhere, one engine a file: each module has NAME and a class Engine(workers)."""
+"""Engines run units somewhere, one engine a file: each module has NAME and a class Engine."""
 
 import abc
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from tcmrl_data.errors import BuildError
+
+ATTEMPTS = 2
+"""A unit that crashed or ran out of time is tried once more; an error that it reports itself is final."""
+
 Message = Callable[[str, Mapping[str, Any]], None]
-"""Receives (unit id, message) as units report."""
+"""Receives (unit id, message) as units report; messages tell of progress, and may get lost."""
 
 
 @dataclass(frozen=True)
@@ -17,12 +22,18 @@ class Unit:
         id: names the unit in messages and logs.
         spec: JSON, understood by `tcmrl_data.unit`.
         cost: relative length, for starting the longest first.
+        cpus: cores to reserve, on engines that know several machines.
+        gpus: graphics processors to reserve there; a fraction shares one.
+        memory: bytes to reserve there.
         timeout: seconds after which an attempt is ended; None for no limit.
     """
 
     id: str
     spec: Mapping[str, Any]
     cost: float = 1.0
+    cpus: float = 1.0
+    gpus: float = 0.0
+    memory: int = 0
     timeout: float | None = None
 
 
@@ -48,11 +59,32 @@ class Result:
 
 
 class BaseEngine(abc.ABC):
-    """Runs units, each at least once, in any order."""
+    """Runs units, each at least once, in any order.
 
-    def __init__(self, workers: int) -> None:
-        self.workers = workers
+    Args:
+        workers: units at a time; as many as there is room for where None.
+        address: of the machines to work on, for engines that reach others.
+
+    Raises:
+        BuildError: the engine takes no address.
+    """
+
+    takes_address = False
+
+    def __init__(self, workers: int | None = None, *, address: str | None = None) -> None:
+        if address is not None and not self.takes_address:
+            raise BuildError(f"this engine takes no address, got {address!r}; leave it out or choose ray")
+        self.workers, self.address = workers, address
 
     @abc.abstractmethod
     def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
-        """Yields one result per unit as units end; closing the iterator stops what still runs."""
+        """Yields one result per unit as units end; closing the iterator ends what still runs.
+
+        Raises:
+            BuildError: a unit asks for more than any machine has; nothing was started.
+        """
+
+
+def longest_first(units: Sequence[Unit]) -> list[Unit]:
+    """The units in the order in which they are started: the last one to end should be a short one."""
+    return sorted(units, key=lambda unit: -unit.cost)

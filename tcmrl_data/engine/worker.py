@@ -1,15 +1,18 @@
 """The process of one unit: `python -m tcmrl_data.engine.worker`, a JSON spec on standard input.
 
 Messages go to standard output as JSON lines, the last one `{"kind": "result", "digest" | "error"}`.
-The process ends when standard input closes, so that a killed driver leaves no orphan.
+The process ends when standard input closes, so that a killed driver leaves no orphan. On SIGTERM it abandons
+the unit: what it published stands, what it had staged is removed.
 """
 
 import json
 import os
+import signal
 import sys
 import threading
 import time
 from collections.abc import Mapping
+from types import FrameType
 from typing import Any
 
 from tcmrl_data.errors import TcmrlError
@@ -43,12 +46,19 @@ class _Reporter:
 
 
 def _end_with_the_driver() -> None:
-    sys.stdin.read()
+    while os.read(0, 4096):  # not sys.stdin: its lock, held here, would abort the interpreter's own end
+        pass
     os._exit(1)
+
+
+def _abandon(signal_number: int, frame: FrameType | None) -> None:
+    signal.signal(signal_number, signal.SIG_IGN)  # asked again, it goes on cleaning up
+    raise SystemExit(128 + signal_number)
 
 
 def main() -> None:
     """Runs the unit whose spec is the first line of standard input."""
+    signal.signal(signal.SIGTERM, _abandon)
     spec = UnitSpec.from_json(json.loads(sys.stdin.readline()))
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
     report = _Reporter()
@@ -59,6 +69,8 @@ def main() -> None:
         report({"kind": "result", "digest": run_unit(spec, report)})
     except TcmrlError as error:
         report({"kind": "result", "error": str(error)})
+    sys.stderr.flush()
+    os._exit(0)  # all is written and told; taking the libraries down in order would take a second
 
 
 if __name__ == "__main__":

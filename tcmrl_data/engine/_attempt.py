@@ -1,0 +1,143 @@
+"""One attempt at a unit: a worker process is started, fed, listened to, and ended when it is time."""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import IO, Any
+
+from tcmrl_data.engine import Result, Unit
+
+ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+POLL_SECONDS = 0.1
+GRACE_SECONDS = 5.0
+"""Between asking a worker to end and killing it."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How an attempt ended; exactly one of the three is set.
+
+    Attributes:
+        digest: the unit's digest: it is done.
+        error: what the unit says is wrong; trying again will not help.
+        crash: how the worker ended without a word.
+    """
+
+    digest: str | None = None
+    error: str | None = None
+    crash: str | None = None
+
+    def result(self, unit: Unit, *, attempt: int, node: str) -> Result:
+        """The unit's result, if this was its last attempt."""
+        return Result(unit.id, self.digest is not None, self.digest, self.error or self.crash, attempt, node)
+
+
+def run_attempt(
+    unit: Unit, on_message: Callable[[Mapping[str, Any]], None], stopping: threading.Event
+) -> Outcome:
+    """Runs a unit in a worker process of its own and waits for its end.
+
+    Args:
+        unit: what to do.
+        on_message: called from another thread with every message but the last.
+        stopping: once set, the worker is ended.
+    """
+    with contextlib.ExitStack() as stack:
+        errors = stack.enter_context(tempfile.TemporaryFile("w+", errors="replace"))
+        try:
+            process = stack.enter_context(_start_worker(errors))
+        except OSError as error:
+            return Outcome(crash=f"no worker could be started: {error}")
+        stack.callback(_hang_up, process)
+        stack.callback(_end, process)  # first, since a worker whose input closes drops everything
+        last: list[Mapping[str, Any]] = []
+        listener = threading.Thread(target=_listen, args=(process, on_message, last), daemon=True)
+        listener.start()
+        with contextlib.suppress(BrokenPipeError):  # it died before it read; its exit code says how
+            assert process.stdin is not None
+            process.stdin.write(json.dumps(unit.spec) + "\n")
+            process.stdin.flush()
+        ended = _wait(process, unit.timeout, stopping)
+        listener.join()
+        if last:
+            return Outcome(digest=last[-1].get("digest"), error=last[-1].get("error"))
+        return Outcome(crash=ended or f"worker {_exit(process)}: {_last_line(errors)}")
+
+
+def _start_worker(errors: IO[str]) -> "subprocess.Popen[str]":
+    return subprocess.Popen(
+        [sys.executable, "-m", "tcmrl_data.engine.worker"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=errors,
+        text=True,
+        env=os.environ | ONE_THREAD,
+        start_new_session=True,  # Ctrl-C in a terminal reaches the driver alone, which then ends its workers
+    )
+
+
+def _listen(
+    process: "subprocess.Popen[str]",
+    on_message: Callable[[Mapping[str, Any]], None],
+    last: list[Mapping[str, Any]],
+) -> None:
+    assert process.stdout is not None
+    for line in process.stdout:
+        if not line.endswith("\n"):
+            return  # torn by the worker's death
+        message = json.loads(line)
+        if message["kind"] == "result":
+            last.append(message)
+        else:
+            on_message(message)
+
+
+def _wait(process: "subprocess.Popen[str]", timeout: float | None, stopping: threading.Event) -> str | None:
+    """Waits for the worker's end; says why, where it was ended."""
+    deadline = time.monotonic() + timeout if timeout is not None else float("inf")
+    while True:
+        try:
+            process.wait(POLL_SECONDS)
+            return None
+        except subprocess.TimeoutExpired:
+            if stopping.is_set():
+                _end(process)
+                return "stopped"
+            if time.monotonic() > deadline:
+                _end(process)
+                return f"ran longer than its {timeout:g} s (build.timeout)"
+
+
+def _end(process: "subprocess.Popen[str]") -> None:
+    """Asks a worker to abandon its unit, and kills it if it does not."""
+    process.terminate()
+    try:
+        process.wait(GRACE_SECONDS)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def _hang_up(process: "subprocess.Popen[str]") -> None:
+    """Closes the worker's input; what a dead worker has not read is of no use."""
+    assert process.stdin is not None
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.close()
+
+
+def _exit(process: "subprocess.Popen[str]") -> str:
+    code = process.returncode
+    return f"was killed by signal {-code}" if code < 0 else f"ended with code {code}"
+
+
+def _last_line(errors: IO[str]) -> str:
+    errors.seek(0)
+    lines = errors.read().strip().splitlines()
+    return lines[-1] if lines else "no message"

@@ -1,0 +1,287 @@
+"""One contract for every engine; those that talk over a network run in tests/test_namespace.py."""
+
+import json
+import os
+import random
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+
+import tcmrl_data
+from tcmrl_data import Dataset, Recipe, load_recipe
+from tcmrl_data.canonical import digest
+from tcmrl_data.discovery import modules, plugin
+from tcmrl_data.engine import BaseEngine, Message, Result, Unit
+from tcmrl_data.errors import BuildError
+from tcmrl_data.manifest import part_folder, read_manifest
+from tcmrl_data.publish import STAGING
+from tcmrl_data.tasks import choose_tasks
+from tcmrl_data.unit import UnitSpec
+from tests.conftest import TASKS, TINY
+from tests.workers import ROOT, command_line, killer, wait_for, worker_pids
+
+ENGINES = [
+    pytest.param(module.NAME, marks=[pytest.mark.loopback] if module.Engine.takes_address else [])
+    for module in modules("tcmrl_data.engine")
+    if hasattr(module, "NAME")
+]
+
+
+@dataclass(frozen=True)
+class EngineCase:
+    """An engine to test, where it works, and the mark that its workers carry."""
+
+    name: str
+    address: str | None
+    mark: str
+
+    def create(self, workers: int) -> BaseEngine:
+        engine: BaseEngine = plugin("tcmrl_data.engine", "engine", self.name).Engine(
+            workers, address=self.address
+        )
+        return engine
+
+    def command(self, out: Path, *, tasks: str, workers: int) -> list[str]:
+        """Arguments of `tcmrl-data` that build a part of the tiny dataset with this engine."""
+        settings = [argument for override in TINY for argument in ("--set", override)]
+        address = [] if self.address is None else ["--ray-address", self.address]
+        command = ["build", "point-robot", "--profile", "quick", *settings, "--engine", self.name, *address]
+        return [*command, "--tasks", tasks, "--workers", str(workers), "--out", str(out)]
+
+
+@pytest.fixture(scope="module", params=ENGINES)
+def engine(request: pytest.FixtureRequest, mark: str) -> EngineCase:
+    networked = plugin("tcmrl_data.engine", "engine", request.param).Engine.takes_address
+    address = request.getfixturevalue("ray_cluster").address if networked else None
+    return EngineCase(request.param, address, mark)
+
+
+def make_units(recipe: Recipe, out: Path, tasks: list[int]) -> list[Unit]:
+    """Units as a build makes them, and the folders that they need."""
+    (out / STAGING).mkdir(parents=True)
+    units = []
+    for task in choose_tasks(recipe, tasks):
+        (out / part_folder(task.index, 0)).parent.mkdir(parents=True)
+        spec = UnitSpec(out.resolve(), recipe, 0, (task,))
+        units.append(Unit(f"task {task.index}", spec.to_json()))
+    return units
+
+
+def run(engine: EngineCase, units: list[Unit], *, workers: int = 2) -> dict[str, Result]:
+    return {result.id: result for result in engine.create(workers).run(units, lambda unit, message: None)}
+
+
+def reference(tiny: Dataset, task: int) -> str:
+    """What a unit must return."""
+    return digest([part.id for part in tiny.manifest.parts if part.task == task])
+
+
+def ids(folder: Path, *tasks: int) -> dict[tuple[int, int], str]:
+    parts = read_manifest(folder).parts
+    return {(part.task, part.step): part.id for part in parts if part.task in (tasks or TASKS)}
+
+
+def has_part(out: Path, task: int, step: int) -> bool:
+    return (out / part_folder(task, step) / "part.json").is_file()
+
+
+def staged(out: Path) -> list[str]:
+    return sorted(path.name for path in (out / STAGING).iterdir())
+
+
+@pytest.mark.parametrize("workers", [1, 4])
+def test_digests_do_not_depend_on_workers_or_order(
+    engine: EngineCase, workers: int, tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    tasks = TASKS[:2] if workers == 1 else TASKS[:4]
+    units = make_units(tiny_recipe, tmp_path / "data", tasks)
+    random.Random(workers).shuffle(units)
+    results = run(engine, [replace(unit, cost=random.random()) for unit in units], workers=workers)
+    assert {name: result.digest for name, result in results.items()} == {
+        f"task {task}": reference(tiny, task) for task in tasks
+    }
+    assert all(result.ok and result.attempt == 1 and result.error is None for result in results.values())
+
+
+def test_a_killed_worker_is_replaced_and_the_data_are_the_same(
+    engine: EngineCase, tiny_folder: Path, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    out = tmp_path / "data"
+    with killer(engine.mark, lambda: has_part(out, 0, 0) and not has_part(out, 0, 150), kills=1) as killed:
+        report = tcmrl_data.build_dataset(
+            tiny_recipe, out, tasks=[0], workers=1, engine=engine.name, address=engine.address
+        )
+    assert len(killed) == 1
+    assert (report.failed, report.built) == ((), 3)
+    assert ids(out) == ids(tiny_folder, 0)
+    assert read_manifest(out).complete
+
+
+def test_an_error_that_a_unit_reports_is_final_and_the_others_are_done(
+    engine: EngineCase, tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    """A file in the place of a part is nothing that another attempt could mend."""
+    units = make_units(tiny_recipe, tmp_path / "data", [3, 40])
+    blocked = tmp_path / "data" / part_folder(3, 100)
+    blocked.write_text("in the way")
+    results = run(engine, units)
+    assert (results["task 3"].ok, results["task 3"].attempt) == (False, 1)
+    assert str(blocked) in str(results["task 3"].error)
+    assert results["task 40"].digest == reference(tiny, 40)
+
+
+def test_a_unit_out_of_time_is_ended_and_tried_once_more(
+    engine: EngineCase, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    (unit,) = make_units(tiny_recipe, tmp_path / "data", [3])
+    (result,) = run(engine, [replace(unit, timeout=0.2)]).values()
+    assert result == Result(
+        "task 3", False, None, "ran longer than its 0.2 s (build.timeout)", 2, result.node
+    )
+    assert worker_pids(engine.mark) == []
+
+
+def test_a_crash_is_told_in_the_words_of_the_worker(
+    engine: EngineCase, tiny: Dataset, tmp_path: Path
+) -> None:
+    """A network of 400 TB is no error of the unit's own: it fails somewhere below."""
+    huge = load_recipe(
+        "point-robot", profile="quick", overrides=[*TINY, "behavior.sac.hidden=[10000000,10000000]"]
+    )
+    (result,) = run(engine, make_units(huge, tmp_path / "data", [3])).values()
+    assert (result.ok, result.digest, result.attempt) == (False, None, 2)
+    assert "worker ended with code 1: RuntimeError" in str(result.error)
+    assert "memory" in str(result.error)
+
+
+def test_a_unit_run_twice_at_once_makes_its_data_once(
+    engine: EngineCase, tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
+    results = run(engine, [unit, replace(unit, id="again")])
+    assert [result.digest for result in results.values()] == [reference(tiny, 40)] * 2
+    assert len(list((tmp_path / "data").rglob("part.json"))) == 3
+    assert staged(tmp_path / "data") == []
+
+
+def test_a_poison_unit_is_named_the_others_are_done_and_the_exit_code_is_1(
+    engine: EngineCase, tiny_folder: Path, tmp_path: Path
+) -> None:
+    """One worker at a time: those that live after task 0 is done, and before task 40 begins, have task 3."""
+    out = tmp_path / "data"
+    with (
+        killer(engine.mark, lambda: has_part(out, 3, 0), kills=1) as first,
+        command_line(*engine.command(out, tasks="0,3,40", workers=1)) as driver,
+    ):
+        wait_for(lambda: first or driver.poll() is not None, "the first kill")
+        with killer(engine.mark, lambda: True, kills=1) as second:
+            _, errors = driver.communicate(timeout=120)
+    assert (len(first), len(second), driver.returncode) == (1, 1, 1)
+    assert "Error: task 3 failed after 2 attempt(s) on " in errors
+    assert "killed by signal 9" in errors
+    assert ids(out, 0, 40) == ids(tiny_folder, 0, 40)
+    assert not read_manifest(out).complete
+
+
+@pytest.mark.parametrize(
+    ("engine", "number"),
+    [
+        pytest.param("local", signal.SIGINT, id="local-SIGINT"),
+        *(pytest.param(*each.values, signal.SIGTERM, marks=each.marks) for each in ENGINES),
+    ],
+    indirect=["engine"],
+)
+def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
+    engine: EngineCase, number: signal.Signals, tmp_path: Path
+) -> None:
+    out = tmp_path / "data"
+    command = engine.command(out, tasks="0,3", workers=2)
+    with command_line(*command, "--quiet") as driver:
+        wait_for(lambda: has_part(out, 0, 0) or has_part(out, 3, 0) or driver.poll() is not None, "a part")
+        os.killpg(driver.pid, number)  # to all of the group, as a terminal does
+        _, errors = driver.communicate(timeout=60)
+    told = [line for line in errors.splitlines() if line.startswith("Error:")]
+    again = shlex.join(["tcmrl-data", *command, "--quiet"])
+    assert told == [f"Error: interrupted; {out} keeps what is finished, to go on run `{again}` again"]
+    assert "Traceback" not in errors
+    assert driver.returncode == 1
+    assert worker_pids(engine.mark) == []
+    assert staged(out) == []
+    assert not read_manifest(out).complete
+
+
+def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
+    engine: EngineCase, tiny_folder: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "data"
+    command = engine.command(out, tasks="0", workers=1)
+    with command_line(*command) as driver:
+        wait_for(lambda: has_part(out, 0, 0) or driver.poll() is not None, "a part")
+        assert worker_pids(engine.mark)
+        driver.kill()
+        driver.wait()
+        wait_for(lambda: not worker_pids(engine.mark), "the end of the workers", seconds=20)
+    assert not has_part(out, 0, 150)
+    with command_line(*command) as driver:
+        _, errors = driver.communicate(timeout=120)
+    assert (driver.returncode, ids(out)) == (0, ids(tiny_folder, 0)), errors
+
+
+def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_done(
+    tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
+    command = [sys.executable, "-m", "tcmrl_data.engine.worker"]
+    with subprocess.Popen(
+        command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as worker:
+        assert worker.stdin is not None
+        worker.stdin.write(json.dumps(unit.spec) + "\n")
+        worker.stdin.flush()
+        wait_for(lambda: list((tmp_path / "data" / STAGING).glob("task_*[!k]")), "a staged part")
+        worker.terminate()
+        assert worker.wait(30) == 128 + signal.SIGTERM
+    assert staged(tmp_path / "data") == []
+    published = {path.parent.name for path in (tmp_path / "data").rglob("part.json")}
+    assert published <= {"step_0000000"}
+    assert run(EngineCase("local", None, ""), [unit])["task 40"].digest == reference(tiny, 40)
+
+
+@pytest.mark.parametrize(
+    ("program", "error"),
+    [("/bin/false", "worker ended with code 1: no message"), ("/nowhere", "no worker could be started: ")],
+)
+def test_a_worker_that_ends_before_it_has_read_its_spec_is_a_crash(
+    program: str, error: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The spec is larger than a pipe holds, so that writing it always meets the closed end."""
+    monkeypatch.setattr(sys, "executable", program)
+    (result,) = run(EngineCase("local", None, ""), [Unit("task 3", {"filler": "x" * 10**6})]).values()
+    assert (result.ok, result.attempt) == (False, 2)
+    assert error in str(result.error)
+
+
+def test_parts_whose_messages_are_lost_are_taken_in_all_the_same(
+    tiny_recipe: Recipe, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker can be killed between publishing a part and telling of it."""
+    local = plugin("tcmrl_data.engine", "engine", "local").Engine
+    run_and_tell = local.run
+
+    def run_silently(self: BaseEngine, units: list[Unit], on_message: Message) -> Iterator[Result]:
+        yield from run_and_tell(self, units, lambda unit, message: None)
+
+    monkeypatch.setattr(local, "run", run_silently)
+    report = tcmrl_data.build_dataset(tiny_recipe, tmp_path / "data", tasks=[3], workers=1)
+    assert (report.built, ids(tmp_path / "data")) == (3, ids(tiny_folder, 3))
+
+
+def test_an_address_is_refused_by_an_engine_that_has_none(tmp_path: Path, tiny_recipe: Recipe) -> None:
+    with pytest.raises(BuildError, match="takes no address, got 'here:1'"):
+        tcmrl_data.build_dataset(tiny_recipe, tmp_path / "data", engine="local", address="here:1")
