@@ -15,9 +15,9 @@ from tcmrl_data.errors import SnapshotError, StoreError, TcmrlError, TrajectoryE
 from tcmrl_data.manifest import STANDARD_ARRAYS, Manifest, PartRecord
 from tcmrl_data.recipe import first_problem
 from tcmrl_data.snapshot import GaussianPolicy, read_snapshot
+from tcmrl_data.statistics import statistics
 from tcmrl_data.store import array_digests, read_arrays, unpack
 from tcmrl_data.tasks import draw_tasks
-from tcmrl_data.unit import statistics
 
 Problem = tuple[str, str]
 """File or array within the part, and what is wrong with it."""

@@ -14,10 +14,11 @@ from tcmrl_data.environment import Environment
 from tcmrl_data.errors import TcmrlError
 from tcmrl_data.layout import DECODED_FLOOR, DECODED_RATIO
 from tcmrl_data.manifest import Manifest, PartRecord
+from tcmrl_data.provenance import provenance
 from tcmrl_data.snapshot import read_snapshot
 from tcmrl_data.store import pack, read_arrays
 from tcmrl_data.tasks import Task
-from tcmrl_data.unit import UnitSpec, provenance, roll_out_part
+from tcmrl_data.unit import UnitSpec, roll_out_part
 
 FIRST_STEPS = 5
 STEP_TOLERANCE = 1e-3

@@ -1,13 +1,9 @@
 """What one worker does: train a unit's behavior policies, roll them out, publish each part. Idempotent."""
 
 import contextlib
-import datetime
 import math
-import platform
-import socket
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +23,19 @@ from tcmrl_data.manifest import (
     Identity,
     PartRecord,
     References,
-    Statistics,
     part_folder,
     read_part_record,
 )
+from tcmrl_data.provenance import package_versions, provenance
 from tcmrl_data.publish import publish_folder
 from tcmrl_data.recipe import Recipe
 from tcmrl_data.rollout import roll_out
 from tcmrl_data.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.snapshot import Snapshot
+from tcmrl_data.statistics import statistics
 from tcmrl_data.store import array_digests, encode_arrays, pack
 from tcmrl_data.tasks import Task
 from tcmrl_data.trajectory import Trajectory
-
-PACKAGES = ("tcmrl", "numpy", "torch", "stable-baselines3", "gymnasium", "mujoco", "metaworld", "zarr")
-QUANTILES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 
 Report = Callable[[Mapping[str, Any]], None]
 """Receives `{"kind": "steps", "count"}` and `{"kind": "part", "task", "step", "id"}`."""
@@ -139,7 +133,7 @@ def _checkpoints(spec: UnitSpec, source: BehaviorSource, task: Task) -> Checkpoi
         "settings": spec.recipe.unit_settings(),
         "seed": spec.seed,
         "task": task.index,
-        "packages": {name: version(name) for name in PACKAGES},
+        "packages": package_versions(),
     }
     missing = [
         step
@@ -286,48 +280,3 @@ def _roll_out_batch(
         reset_seeds=[keyed_seed(*key, Purpose.ROLLOUT_RESET, step, episode) for episode in episodes],
         noise=[keyed_generator(*key, Purpose.ROLLOUT_NOISE, step, episode) for episode in episodes],
     )
-
-
-def statistics(trajectories: Sequence[Trajectory]) -> Statistics:
-    """Return statistics and mergeable moments of a part."""
-    returns = np.array([each.undiscounted_return for each in trajectories])
-    success = [bool(np.any(each.extras["success"])) for each in trajectories if "success" in each.extras]
-    moments = {}
-    for name in ("observations", "actions"):
-        rows = np.concatenate([getattr(each, name) for each in trajectories]).astype(np.float64)
-        moments[name] = {
-            "count": len(rows),
-            "sum": rows.sum(axis=0).tolist(),
-            "sum_of_squares": np.square(rows).sum(axis=0).tolist(),
-        }
-    return Statistics(
-        episodes=len(trajectories),
-        steps=sum(len(each) for each in trajectories),
-        mean=float(returns.mean()),
-        std=float(returns.std()),
-        min=float(returns.min()),
-        max=float(returns.max()),
-        quantiles=tuple(float(each) for each in np.quantile(returns, QUANTILES)),
-        success_rate=float(np.mean(success)) if success else None,
-        moments=moments,
-    )
-
-
-def provenance(environment: Environment) -> dict[str, Any]:
-    """Where, when and with what a part was made."""
-    return {
-        "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-        "host": socket.gethostname(),
-        "platform": platform.platform(),
-        "cpu": _cpu_model(),
-        "python": platform.python_version(),
-        "packages": {name: version(name) for name in PACKAGES},
-        "physics": environment.fingerprint(),
-    }
-
-
-def _cpu_model() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor()
