@@ -8,10 +8,13 @@ import sys
 import tomllib
 from pathlib import Path
 
+import jaxtyping
 import pytest
+import torch
 
 import tcmrl_algo
 import tcmrl_data
+from tcmrl_algo import losses
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = {
@@ -112,3 +115,9 @@ def test_every_dependency_is_pinned_and_explained() -> None:
     assert names <= pinned
     explained = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     assert [name for name in sorted(names) if f"| {name} |" not in explained] == []
+
+
+def test_stated_shapes_are_checked_at_every_call() -> None:
+    """pytest's `--jaxtyping-packages` in pyproject.toml does it; without it, shapes are comments."""
+    with pytest.raises(jaxtyping.TypeCheckError, match="sparsity_loss"):
+        losses.sparsity_loss(torch.zeros(2, 3), torch.ones(3, 2, dtype=torch.bool))
