@@ -61,6 +61,7 @@ class Driver:
         """
         missing = [task for task in self._tasks.values() if not self._is_done(task.index)]
         units = [self._unit(task) for task in sorted(missing, key=lambda task: task.index)]
+        index_of = {_unit_id(task.index): task.index for task in missing}
         self._steps_total = self._source.training_steps * len(units)
         _make_groups(self._out, missing)
         failures: list[str] = []
@@ -70,12 +71,16 @@ class Driver:
             results = engine.run(units, lambda unit, message: self._on_message(unit, message, log))
             with contextlib.closing(results):
                 for result in results:
-                    self._take_in_published(result.id)
+                    self._take_in_published(index_of[result.id])
                     if result.ok:
                         log.write(self._event("unit_done", f"{result.id} done", result.id))
                     else:
                         failures.append(_failure(result))
                         log.write(self._event("unit_failed", failures[-1], result.id))
+        except KeyboardInterrupt:
+            for task in missing:
+                self._take_in_published(task.index)
+            raise
         finally:
             self.write_manifest()
             log.write(self._event("end", f"{len(self.parts)} parts, {len(failures)} tasks failed"))
@@ -107,9 +112,8 @@ class Driver:
             self.write_manifest()
         log.write(self._event("part", f"{unit}, step {message['step']}", unit))
 
-    def _take_in_published(self, unit: str) -> None:
-        """Takes in a unit's parts whose messages were lost, with the worker that published them."""
-        index = next(index for index in self._tasks if unit == _unit_id(index))
+    def _take_in_published(self, index: int) -> None:
+        """Takes in a task's parts whose messages were lost, with the worker that published them."""
         for step in self._source.steps:
             known = (index, step) in self.parts
             if not known and (self._out / part_folder(index, step) / "part.json").is_file():

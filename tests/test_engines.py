@@ -10,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import IO
 
 import pytest
 
@@ -17,7 +18,7 @@ import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
 from tcmrl_data.canonical import digest
 from tcmrl_data.discovery import modules, plugin
-from tcmrl_data.engine import BaseEngine, Message, Result, Unit
+from tcmrl_data.engine import BaseEngine, Message, Result, Unit, _attempt
 from tcmrl_data.errors import BuildError
 from tcmrl_data.manifest import part_folder, read_manifest
 from tcmrl_data.publish import STAGING
@@ -31,6 +32,9 @@ ENGINES = [
     for module in modules("tcmrl_data.engine")
     if hasattr(module, "NAME")
 ]
+
+LONG = (*TINY, "behavior.sac.steps=100000", "behavior.sac.snapshots=[0,100,100000]")
+"""Units that take minutes: they end in time only if they are ended."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +51,9 @@ class EngineCase:
         )
         return engine
 
-    def command(self, out: Path, *, tasks: str, workers: int) -> list[str]:
+    def command(self, out: Path, *, tasks: str, workers: int, overrides: tuple[str, ...] = TINY) -> list[str]:
         """Arguments of `tcmrl-data` that build a part of the tiny dataset with this engine."""
-        settings = [argument for override in TINY for argument in ("--set", override)]
+        settings = [argument for override in overrides for argument in ("--set", override)]
         address = [] if self.address is None else ["--ray-address", self.address]
         command = ["build", "point-robot", "--profile", "quick", *settings, "--engine", self.name, *address]
         return [*command, "--tasks", tasks, "--workers", str(workers), "--out", str(out)]
@@ -201,9 +205,10 @@ def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
     engine: EngineCase, number: signal.Signals, tmp_path: Path
 ) -> None:
     out = tmp_path / "data"
-    command = engine.command(out, tasks="0,3", workers=2)
+    command = engine.command(out, tasks="0,3", workers=2, overrides=LONG)
     with command_line(*command, "--quiet") as driver:
         wait_for(lambda: has_part(out, 0, 0) or has_part(out, 3, 0) or driver.poll() is not None, "a part")
+        assert all(os.getpgid(pid) != driver.pid for pid in worker_pids(engine.mark))
         os.killpg(driver.pid, number)  # to all of the group, as a terminal does
         _, errors = driver.communicate(timeout=60)
     told = [line for line in errors.splitlines() if line.startswith("Error:")]
@@ -213,7 +218,8 @@ def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
     assert driver.returncode == 1
     assert worker_pids(engine.mark) == []
     assert staged(out) == []
-    assert not read_manifest(out).complete
+    assert read_manifest(out).parts
+    assert {part.step for part in read_manifest(out).parts} <= {0, 100}
 
 
 def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
@@ -231,6 +237,17 @@ def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
     with command_line(*command) as driver:
         _, errors = driver.communicate(timeout=120)
     assert (driver.returncode, ids(out)) == (0, ids(tiny_folder, 0)), errors
+
+
+def test_a_worker_ends_with_its_driver(tiny_recipe: Recipe, tmp_path: Path) -> None:
+    """That is, when its input closes, long before it has anything to say."""
+    (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
+    command = [sys.executable, "-m", "tcmrl_data.engine.worker"]
+    worker = subprocess.run(
+        command, cwd=ROOT, text=True, input=json.dumps(unit.spec) + "\n", capture_output=True, check=False
+    )
+    assert (worker.returncode, worker.stdout) == (1, "")
+    assert list((tmp_path / "data").rglob("part.json")) == []
 
 
 def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_done(
@@ -260,9 +277,17 @@ def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_do
 def test_a_worker_that_ends_before_it_has_read_its_spec_is_a_crash(
     program: str, error: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The spec is larger than a pipe holds, so that writing it always meets the closed end."""
+    """The worker's end is awaited before its spec is written, which then meets a closed pipe."""
+    start = _attempt._start_worker
+
+    def start_and_outlive(errors: IO[str]) -> "subprocess.Popen[str]":
+        worker = start(errors)
+        worker.wait()
+        return worker
+
+    monkeypatch.setattr(_attempt, "_start_worker", start_and_outlive)
     monkeypatch.setattr(sys, "executable", program)
-    (result,) = run(EngineCase("local", None, ""), [Unit("task 3", {"filler": "x" * 10**6})]).values()
+    (result,) = run(EngineCase("local", None, ""), [Unit("task 3", {})]).values()
     assert (result.ok, result.attempt) == (False, 2)
     assert error in str(result.error)
 

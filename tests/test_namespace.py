@@ -30,7 +30,7 @@ def test_what_needs_a_network_holds_in_a_namespace_of_its_own(tiny_folder: Path)
         pytest.skip(f"no network namespace can be made here: {probe.stderr.strip()}")
     pytest_of_its_own = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "-m", "loopback"]
     result = subprocess.run(
-        in_namespace([*pytest_of_its_own, "--tiny", str(tiny_folder), "tests"]),
+        in_namespace([*pytest_of_its_own, f"--tiny={tiny_folder}", "tests"]),
         cwd=ROOT,
         capture_output=True,
         text=True,
