@@ -1,6 +1,7 @@
 """What a part's arrays must say: digests, episodes, values, flags, statistics, policy."""
 
 import math
+import re
 from collections.abc import Iterator, Mapping
 from itertools import pairwise
 from pathlib import Path
@@ -12,7 +13,7 @@ from pydantic import ValidationError
 
 from tcmrl_data.environment import Environment
 from tcmrl_data.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
-from tcmrl_data.manifest import STANDARD_ARRAYS, Manifest, PartRecord
+from tcmrl_data.manifest import MAX_TASKS, STANDARD_ARRAYS, Manifest, PartRecord
 from tcmrl_data.recipe import first_problem
 from tcmrl_data.snapshot import GaussianPolicy, read_snapshot
 from tcmrl_data.statistics import statistics
@@ -24,9 +25,6 @@ Problem = tuple[str, str]
 
 CLOSE = 1e-9
 """Relative tolerance of recomputed sums, which another machine may add up in another order."""
-
-MAX_TASKS = 10_000
-"""Task sets are drawn again only up to this size; a stranger's recipe may claim any."""
 
 
 def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None) -> Iterator[Problem]:
@@ -43,13 +41,14 @@ def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None
         try:
             arrays |= read_arrays(folder, [name])
         except StoreError as error:
-            yield name, str(error).removeprefix(str(folder))
+            yield _place(error, folder, default=name)
             continue
         if array_digests({name: arrays[name]})[name] != recorded.model_dump(mode="json"):
             yield name, "decoded values do not have the recorded sha256"
     if len(arrays) < len(record.identity.arrays):
         return
-    yield from _value_problems(arrays)
+    problems = list(_value_problems(arrays))
+    yield from problems
     if manifest is not None:
         yield from _shape_problems(arrays, manifest)
     try:
@@ -58,6 +57,8 @@ def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None
         yield "episode_offsets", str(error)
         return
     yield from _flag_problems(arrays)
+    if problems:
+        return  # sums over values that are not finite say nothing
     found = statistics(episodes).model_dump()
     for field, recorded_value in record.statistics.model_dump().items():
         if not is_close(found[field], recorded_value):
@@ -66,12 +67,12 @@ def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None
 
 def task_problems(manifest: Manifest) -> Iterator[str]:
     """Tasks of the manifest whose parameters or split the recipe does not draw."""
-    if manifest.recipe.environment.get("tasks", 0) > MAX_TASKS:
-        yield f"recipe.environment.tasks is {manifest.recipe.environment['tasks']}, more than {MAX_TASKS}"
-        return
     environment = _environment(manifest)
     if isinstance(environment, str):
         yield environment
+        return
+    if environment.settings.tasks > MAX_TASKS:
+        yield f"recipe.environment.tasks is {environment.settings.tasks}, more than {MAX_TASKS}"
         return
     drawn = {task.index: task for task in draw_tasks(environment)}
     for task in manifest.tasks:
@@ -94,6 +95,12 @@ def is_close(left: Any, right: Any) -> bool:
     return bool(left == right)
 
 
+def _place(error: Exception, folder: Path, *, default: str) -> Problem:
+    """The file within a part that an error names first, and what it says of it."""
+    match = re.fullmatch(r"([a-z0-9_./]+?):? (.*)", str(error).removeprefix(f"{folder}/"))
+    return (match[1], match[2]) if match else (default, str(error))
+
+
 def _environment(manifest: Manifest) -> Environment | str:
     """The manifest's environment, or why there is none."""
     try:
@@ -108,7 +115,7 @@ def _policy_problems(folder: Path, record: PartRecord, manifest: Manifest | None
     try:
         snapshot = read_snapshot(folder, record.identity.step)
     except SnapshotError as error:
-        yield "policy.json", str(error).removeprefix(str(folder))
+        yield _place(error, folder, default="policy.json")
         return
     if snapshot.digest() != record.identity.policy:
         yield "policy.json", "the policy does not have the recorded digest"

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from tcmrl_data.canonical import canonical_json, parse_json
 from tcmrl_data.errors import StoreError
-from tcmrl_data.plain_files import one_line, read_plain_file
+from tcmrl_data.plain_files import folder_problem, one_line, read_plain_file
 
 METADATA_BYTES = 2**16
 MAX_CHUNKS = 10**5
@@ -114,6 +114,9 @@ def read_layout(folder: Path, name: str) -> ArrayLayout:
     Raises:
         StoreError: its `zarr.json` is missing or outside the allow-list.
     """
+    blocked = folder_problem(folder, name)
+    if blocked:
+        raise StoreError(f"{folder / name / 'zarr.json'} is missing: {blocked[0]} {blocked[1]}")
     metadata = _read_metadata(_ArrayMetadata, folder / name / "zarr.json")
     layout = ArrayLayout(name, metadata.data_type, metadata.shape, metadata.chunks)
     if prod(layout.grid) > MAX_CHUNKS:

@@ -3,9 +3,9 @@
 import re
 from collections.abc import Iterable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, field_validator, model_validator
+from pydantic import FailFast, Field, field_validator, model_validator
 
 from tcmrl_data.canonical import MAX_JSON_BYTES, canonical_json, digest, parse_json, sha256
 from tcmrl_data.errors import ManifestError
@@ -20,7 +20,8 @@ DATA_VERSION = 1
 """Raised by hand when the code's data change for the same recipe and seed."""
 
 MANIFEST = "manifest.json"
-PART_RECORD_BYTES = 2**20
+PART_RECORD_BYTES = 2**18
+MAX_TASKS = 2_000
 SHA256 = r"^[0-9a-f]{64}$"
 MAX_INDEX = 2**31
 """Bound of task indices and steps, which become folder names."""
@@ -186,11 +187,11 @@ class Manifest(Record):
     seed: int = Field(ge=0)
     recipe: Recipe
     steps: tuple[int, ...]
-    tasks: tuple[TaskRecord, ...]
-    parts: tuple[PartEntry, ...]
+    tasks: Annotated[tuple[TaskRecord, ...], FailFast()]
+    parts: Annotated[tuple[PartEntry, ...], FailFast()]
     root: str = Field(pattern=SHA256)
     complete: bool
-    references: dict[str, TaskReferences]
+    references: dict[str, TaskReferences] = Field(max_length=MAX_TASKS)
 
     @property
     def profile(self) -> Profile:

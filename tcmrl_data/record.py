@@ -41,9 +41,18 @@ def validated(kind: type[Kind], values: Any, file: Path, *, version: int) -> Kin
         place = printable(hidden)[:200]
         raise ManifestError(f"{file}: {place} holds control characters, which a terminal would obey")
     try:
+        # errors over JSON text copy what they complain of, over and over; these refer to it
+        kind.model_validate(_with_tuples(values))
         return kind.model_validate_json(canonical_json(values))
     except ValidationError as error:
         raise ManifestError(f"{file}: {printable(first_problem(error))[:500]}") from None
+
+
+def _with_tuples(value: Any) -> Any:
+    """Parsed JSON as strict validation of Python values wants it."""
+    if isinstance(value, dict):
+        return {key: _with_tuples(each) for key, each in value.items()}
+    return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
 
 
 def _hidden_text(value: Any, place: str = "") -> str | None:

@@ -236,7 +236,8 @@ class _Verification:
         self.expected.add(file)
         status = self.scan.files.get(file)
         if status is None:
-            self._add(file, "is missing")
+            blocked = folder_problem(self.folder, str(Path(file).parent))
+            self._add(file, f"cannot be reached: {blocked[0]} {blocked[1]}" if blocked else "is missing")
         elif file_problem(status):
             return  # reported with everything else that is odd
         elif status.st_size != size:

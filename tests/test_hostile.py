@@ -1,0 +1,183 @@
+"""Nothing that a stranger puts into a dataset runs, leads out of it, blocks, writes, or takes memory."""
+
+import contextlib
+import gc
+import os
+import resource
+import shutil
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+import pytest
+from tcmrl_cli.data import data
+from tcmrl_cli.frame import run
+
+import tcmrl_data
+from tcmrl_data import TcmrlError, open_dataset, verify_dataset
+from tests.hostile_corpus import CASES, STEP, TASKS, Case, Forge, base
+
+MEMORY_FLOOR = 64 * 2**20
+MEMORY_RATIO = 8
+"""A case may make the process grow by 64 MiB and 8 times its size on disk."""
+
+ADDRESS_SPACE = 2**30
+"""What a case may at most ask for, touched or not; a larger request fails as it would on a full machine."""
+
+SECONDS = 30
+opened: list[str] = []
+watching = False
+
+
+def _note_open(event: str, arguments: tuple[Any, ...]) -> None:
+    if watching and event == "open" and isinstance(arguments[0], str | bytes):
+        opened.append(os.path.realpath(os.fsdecode(arguments[0])))
+
+
+sys.addaudithook(_note_open)
+
+
+@pytest.fixture(scope="module")
+def two_parts(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = base(tiny_folder, tmp_path_factory.mktemp("hostile") / "base")
+    look(folder)  # imports and caches are no part of any case's memory
+    return folder
+
+
+@pytest.fixture
+def forge(two_parts: Path, tmp_path: Path) -> Forge:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (outside / "secret").write_text("secret")
+    shutil.copytree(two_parts, tmp_path / "data")
+    return Forge(tmp_path / "data", outside)
+
+
+def look(folder: Path) -> tuple[str, str]:
+    """Opens and reads everything; the stage that refused, and what it said."""
+    try:
+        dataset = open_dataset(folder)
+    except TcmrlError as error:
+        return "open", str(error)
+    try:
+        for task in TASKS:
+            assert dataset.trajectories(task, STEP)
+            assert dataset.snapshot(task, STEP).digest()
+    except TcmrlError as error:
+        return "read", str(error)
+    return "verify", ""
+
+
+def files_of(folder: Path) -> dict[str, tuple[int, int, int]]:
+    status = {str(path): path.lstat() for path in [folder, *folder.rglob("*")]}
+    return {path: (each.st_mode, each.st_size, each.st_mtime_ns) for path, each in status.items()}
+
+
+def resident_bytes(field: str) -> int:
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(field))
+    return int(line.split()[1]) * 1024
+
+
+@contextlib.contextmanager
+def guarded(forge: Forge) -> Iterator[None]:
+    """Fails where code ran, a path outside was opened, a file changed, memory grew, or nothing came back."""
+
+    def ring(number: int, frame: FrameType | None) -> None:
+        raise AssertionError(f"blocked for {SECONDS} s")
+
+    global watching
+    before = files_of(forge.folder.parent)
+    on_disk = sum(size for _, size, _ in before.values())
+    gc.collect()
+    old = signal.signal(signal.SIGALRM, ring)
+    Path("/proc/self/clear_refs").write_text("5")  # starts the peak of resident memory anew
+    resident = resident_bytes("VmRSS")
+    opened.clear()
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    resource.setrlimit(resource.RLIMIT_AS, (resident_bytes("VmSize") + ADDRESS_SPACE, limits[1]))
+    signal.alarm(SECONDS)
+    watching = True
+    try:
+        yield
+    finally:
+        watching = False
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, old)
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+    bound = MEMORY_FLOOR + MEMORY_RATIO * on_disk
+    assert resident_bytes("VmHWM") - resident <= bound
+    assert not forge.marker.exists(), "code of the dataset ran"
+    assert [path for path in opened if Path(path).is_relative_to(forge.outside)] == []
+    assert files_of(forge.folder.parent) == before
+
+
+def test_the_corpus_is_large_and_its_base_is_sound(two_parts: Path) -> None:
+    sys.stdout.write(f"hostile cases: {len(CASES)}\n")
+    assert len(CASES) >= 60
+    assert len({case.name for case in CASES}) == len(CASES)
+    assert look(two_parts) == ("verify", "")
+    assert verify_dataset(two_parts, level="deep", replay=1).findings == ()
+
+
+@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name.replace(" ", "-"))
+def test_a_hostile_dataset_is_refused(forge: Forge, case: Case, capsys: pytest.CaptureFixture[str]) -> None:
+    case.damage(forge)
+    with guarded(forge):
+        stage, message = look(forge.folder)
+        findings = verify_dataset(forge.folder, level="deep", replay=1).findings
+        codes = [run(data, ["inspect", table, str(forge.folder)]) for table in ("tasks", "episodes")]
+        codes.append(run(data, ["verify", str(forge.folder), "--quiet"]))
+    printed = capsys.readouterr()
+    assert stage == case.stage
+    if stage != "verify":
+        assert case.file in message
+        assert case.words in message
+    named = [each for each in findings if case.file in each.file and case.words in each.problem]
+    assert named, findings
+    assert codes[0] == (2 if stage == "open" else 0)
+    assert codes[1] == 0 if stage == "verify" else codes[1] in (0, 2)
+    assert codes[2] in (0, 1)
+    assert "Traceback" not in printed.err
+    assert all(each.isprintable() for each in (printed.out + printed.err).replace("\n", ""))
+
+
+WRITERS: dict[str, Callable[[Path], object]] = {
+    "build": lambda folder: tcmrl_data.build_dataset(
+        open_dataset(folder).manifest.recipe, folder, tasks=list(TASKS)
+    ),
+    "repair": tcmrl_data.repair_dataset,
+    "gc": tcmrl_data.collect_garbage,
+}
+
+
+@pytest.mark.parametrize("name", [".lock", ".staging", ".checkpoints", "events.jsonl"])
+@pytest.mark.parametrize("command", WRITERS)
+def test_nothing_is_written_through_a_link(forge: Forge, name: str, command: str) -> None:
+    target = forge.outside / "secret"
+    if name in (".staging", ".checkpoints"):
+        target = forge.outside
+    (forge.folder / name).symlink_to(target)
+    before = files_of(forge.outside)
+    with pytest.raises(TcmrlError, match=name):
+        WRITERS[command](forge.folder)
+    assert files_of(forge.outside) == before
+
+
+def test_status_shows_a_strangers_record_without_obeying_it(
+    forge: Forge, capsys: pytest.CaptureFixture[str]
+) -> None:
+    numbers = '"tasks_done":0,"tasks_total":1,"parts_done":0,"parts_total":1,"steps_done":0,"steps_total":1'
+    lines = [
+        f'{{"time":1,"process":1,"kind":"start","unit":null,"message":"",{numbers}}}',
+        f'{{"time":"x","process":1,"kind":"unit_failed","unit":null,"message":"a",{numbers}}}',
+        f'{{"time":NaN,"process":1,"kind":"unit_failed","unit":null,"message":"b",{numbers}}}',
+        f'{{"time":2,"process":1,"kind":"unit_failed","unit":"t","message":"c\\u001b[2J[red]",{numbers}}}',
+    ]
+    (forge.folder / "events.jsonl").write_text("\n".join(lines) + "\n")
+    assert run(data, ["status", str(forge.folder)]) == 0
+    printed = capsys.readouterr().out
+    assert r"c\x1b[2J[red]" in printed
+    assert printed.count("failed") == 1
