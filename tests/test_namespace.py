@@ -6,6 +6,7 @@ test starts can be reached from outside or reach out itself.
 
 import importlib.util
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,8 @@ def test_what_needs_a_network_holds_in_a_namespace_of_its_own(tiny_folder: Path)
         pytest.skip("this machine has the loopback alone, so those tests run directly")
     if importlib.util.find_spec("ray") is None:
         pytest.skip("Ray is not installed; pip install 'tcmrl[ray]'")
+    if shutil.which("unshare") is None:
+        pytest.skip("no network namespace can be made here: no program unshare (util-linux)")
     probe = subprocess.run(in_namespace(["true"]), capture_output=True, text=True, check=False)
     if probe.returncode:
         pytest.skip(f"no network namespace can be made here: {probe.stderr.strip()}")
