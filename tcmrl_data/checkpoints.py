@@ -62,7 +62,7 @@ class CheckpointFolder:
         earlier = self._files()
         replace_file(self._folder / f"{sha256(data)}.safetensors", data, staging=self._dataset / STAGING)
         for file in earlier:
-            file.unlink()
+            file.unlink(missing_ok=True)  # the same unit may run twice at once
         self._saved = time.monotonic()
 
     def load(self) -> Checkpoint | None:
@@ -71,15 +71,15 @@ class CheckpointFolder:
         from safetensors.numpy import load
 
         for file in self._files():
-            data = file.read_bytes()
-            if sha256(data) != file.stem:
-                continue
             try:
+                data = file.read_bytes()
+                if sha256(data) != file.stem:
+                    continue
                 header_bytes = int.from_bytes(data[:8], "little")
                 state = parse_json(parse_json(data[8 : 8 + header_bytes])["__metadata__"]["state"].encode())
                 if state["key"] == self._key and state["values"]["steps"] < self._before:
                     return Checkpoint(state["values"], load(data))
-            except (ValueError, KeyError, TypeError, SafetensorError):
+            except (OSError, ValueError, KeyError, TypeError, SafetensorError):
                 continue
         return None
 

@@ -60,7 +60,8 @@ def make_folders(path: Path) -> None:
     missing = [each for each in (path, *path.parents) if not each.exists()]
     with _named_errors(path):
         for each in reversed(missing):
-            disk.make_folder(each)
+            with contextlib.suppress(FileExistsError):  # another worker may have made it meanwhile
+                disk.make_folder(each)
             disk.sync(each.parent)
 
 
