@@ -123,7 +123,7 @@ class _Verification:
 
     Attributes:
         expected: files that belong to the dataset.
-        opaque: parts whose record cannot be read, so that nobody knows which files belong to them.
+        opaque: parts whose record is not to be trusted, so that nobody knows what belongs to them.
     """
 
     folder: Path
@@ -222,11 +222,14 @@ class _Verification:
             self.opaque.add(f"{place}/")
             self._add(file, words_after(error, self.folder / file))
             return
-        self.records[key] = record
         if self.manifest is not None:
             entry, task = self.entries[key], self.tasks[key[0]]
             for problem in identity_problems(record, sealed, entry=entry, task=task, manifest=self.manifest):
                 self._add(file, problem)
+            if sealed != entry.sha256:
+                self.opaque.add(f"{place}/")  # what the record says of other files may be the damage
+                return
+        self.records[key] = record
         for name, recorded in record.files.items():
             self._check_file(f"{place}/{name}", recorded.size, recorded.sha256)
         for name, problem in layout_problems(self.folder / place, record):
