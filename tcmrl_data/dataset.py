@@ -43,7 +43,7 @@ def open_dataset(path: str | Path) -> "Dataset":
 
     Raises:
         ManifestError: the manifest or a part's record is missing, truncated, edited or of another version.
-        StoreError: a file of a part is missing, of another size, a link, or outside the allow-list.
+        StoreError: a part's file is missing, of another size, linked, outside the allow-list, or a bomb.
 
     Example:
         >>> dataset = open_dataset("data/point-robot")  # doctest: +SKIP
@@ -52,14 +52,15 @@ def open_dataset(path: str | Path) -> "Dataset":
     folder = Path(path).parent if Path(path).name == MANIFEST else Path(path)
     dataset = Dataset(folder, read_manifest(folder))
     layouts: list[ArrayLayout] = []
+    stored_bytes = 0
     for entry in dataset.manifest.parts:
         problem = folder_problem(folder, part_folder(entry.task, entry.step))
         if problem:
             raise StoreError(f"{folder / problem[0]} {problem[1]}; run `tcmrl-data repair {folder}`")
-        layouts += check_files(
-            dataset.folder_of(entry.task, entry.step), dataset.part(entry.task, entry.step)
-        )
-    check_expansion(layouts, dataset.stored_bytes, folder)
+        record = dataset.part(entry.task, entry.step)
+        layouts += check_files(dataset.folder_of(entry.task, entry.step), record)
+        stored_bytes += sum(file.size for file in record.files.values())
+    check_expansion(layouts, stored_bytes, folder)
     return dataset
 
 
@@ -94,15 +95,8 @@ class Dataset:
         try:
             return self.manifest.recipe.make_environment()
         except ValidationError as error:
-            raise ManifestError(
-                f"{self.folder / MANIFEST}: recipe.environment: {first_problem(error)}"
-            ) from None
-
-    @property
-    def stored_bytes(self) -> int:
-        """Bytes of all recorded files of the parts that the manifest names."""
-        records = (self.part(entry.task, entry.step) for entry in self.manifest.parts)
-        return sum(file.size for record in records for file in record.files.values())
+            place = f"{self.folder / MANIFEST}: recipe.environment"
+            raise ManifestError(f"{place}: {first_problem(error)}") from None
 
     @property
     def train_tasks(self) -> tuple[Task, ...]:

@@ -23,8 +23,7 @@ MANIFEST = "manifest.json"
 PART_RECORD_BYTES = 2**18
 MAX_TASKS = 2_000
 SHA256 = r"^[0-9a-f]{64}$"
-MAX_INDEX = 2**31
-"""Bound of task indices and steps, which become folder names."""
+MAX_INDEX = 2**31  # task indices and steps become folder names
 
 STANDARD_ARRAYS = {
     "observations": ("float32", 2),
@@ -88,14 +87,13 @@ class Identity(Record):
             if (arrays[name].dtype, len(arrays[name].shape)) != (dtype, rank):
                 raise ValueError(f"{name} must be {dtype} of rank {rank}")
         steps, episodes = arrays["actions"].shape[0], arrays["episode_offsets"].shape[0] - 1
-        rows = dict.fromkeys(arrays, steps)
-        rows |= {"observations": steps + episodes, "episode_offsets": episodes + 1}
+        rows = {"observations": steps + episodes, "episode_offsets": episodes + 1}
         for name, record in arrays.items():
             if not re.fullmatch(_ARRAY_NAME, name):
                 raise ValueError(f"{name[:80]!r} is no array name")
             if name not in STANDARD_ARRAYS and len(record.shape) != 1:
                 raise ValueError(f"{name} must be of rank 1")
-            if record.shape[0] != rows[name] or episodes < 1 or min(record.shape) < 0:
+            if record.shape[0] != rows.get(name, steps) or episodes < 1 or min(record.shape) < 0:
                 raise ValueError(f"{name}: shape {list(record.shape)} does not fit {steps} steps")
         return arrays
 
@@ -205,12 +203,9 @@ class Manifest(Record):
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> "Manifest":
-        indices = [task.index for task in self.tasks]
-        keys = [(part.task, part.step) for part in self.parts]
-        if indices != sorted(set(indices)):
-            raise ValueError("tasks must be sorted by index, each once")
-        if list(self.steps) != sorted(set(self.steps)):
-            raise ValueError("steps must rise")
+        indices, keys = [task.index for task in self.tasks], [(each.task, each.step) for each in self.parts]
+        if indices != sorted(set(indices)) or list(self.steps) != sorted(set(self.steps)):
+            raise ValueError("tasks and steps must be sorted, each once")
         if keys != sorted(set(keys)):
             raise ValueError("parts must be sorted by task and step, each once")
         missing = {"source", "observation", "reward", "settings"} - set(self.recipe.behavior)
@@ -218,9 +213,9 @@ class Manifest(Record):
             raise ValueError(f"recipe.behavior lacks {', '.join(sorted(missing))}")
         if self.recipe.environment.get("name") != self.name:
             raise ValueError("recipe.environment.name is not the manifest's name")
+        tasks, steps = set(indices), set(self.steps)
         if self.root != merkle_root(self.parts):
             raise ValueError("root does not match the parts")
-        tasks, steps = set(indices), set(self.steps)
         if any(task not in tasks or step not in steps for task, step in keys):
             raise ValueError("parts names a task or step that the dataset does not have")
         if self.complete != (len(keys) == len(tasks) * len(steps)):
