@@ -27,7 +27,7 @@ from tcmrl_data.scan import check_work_files
 from tcmrl_data.verify import Finding, Key, VerifyLevel, verify_dataset
 
 REPAIR = "repair"
-"""Folder in `.staging` where parts are made again; it stays when a repair is killed, and the next goes on."""
+"""Folder in `.staging` where parts are made again; after a killed repair the next one starts it anew."""
 
 
 @dataclass(frozen=True)
@@ -109,11 +109,9 @@ def _make_again(
     tasks = sorted({task for task, _ in keys})
     for entry in manifest.parts:
         place = part_folder(entry.task, entry.step)
-        if entry.task in tasks and (entry.task, entry.step) not in keys and not (target / place).exists():
+        if entry.task in tasks and (entry.task, entry.step) not in keys:
             make_folders((target / place).parent)
-            copy = target / f"{place}.{uuid.uuid4().hex}"
-            shutil.copytree(folder / place, copy)
-            move_into_place(copy, target / place)
+            shutil.copytree(folder / place, target / place)
     report = build_dataset(
         manifest.recipe, target, seed=manifest.seed, tasks=tasks, workers=workers, progress=progress
     )
