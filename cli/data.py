@@ -20,9 +20,7 @@ def main() -> None:
     sys.exit(run(data))
 
 
-@click.group(
-    name="tcmrl-data", context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100}
-)
+@click.group(name="tcmrl-data", context_settings=CONTEXT)
 @click.version_option(package_name="tcmrl")
 def data() -> None:
     """Make, look at and convert datasets for offline meta-reinforcement learning.

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 from tcmrl_cli.data import data
-from tcmrl_cli.frame import duration, run, size
+from tcmrl_cli.frame import duration, size
 from tcmrl_cli.progress import StageProgress
 
 import tcmrl_data
 from tcmrl_data import BuildReport, Dataset, Recipe
+from tests.commands import Call, assert_refused, in_process
 from tests.conftest import TASKS, TINY
 
 Copy = Callable[[], Path]
@@ -25,29 +26,8 @@ SETTINGS = [argument for text in TINY for argument in ("--set", text)]
 
 
 @pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
-    """Runs `tcmrl-data` in this process: exit code, standard output, standard error."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        code = run(data, [str(each) for each in arguments])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
-
-
-Call = Callable[..., tuple[int, str, str]]
-
-
-def assert_refused(result: tuple[int, str, str], *expected: str) -> None:
-    code, output, errors = result
-    assert code == 2
-    assert output == ""
-    lines = errors.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("Error: ")
-    for text in expected:
-        assert text in lines[0]
+def call(capsys: pytest.CaptureFixture[str]) -> Call:
+    return in_process(data, capsys)
 
 
 def test_envs_lists_every_environment(call: Call) -> None:

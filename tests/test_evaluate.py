@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tcmrl_cli.frame import run
 from tcmrl_cli.train import tcmrl
 from torch import Tensor
 
@@ -27,9 +26,9 @@ from tcmrl_data import (
     TrainingError,
     Trajectory,
 )
+from tests.commands import Call, in_process
 
 SMALL = ("batch.transitions=8", "actor_critic.hidden=[8]", "tcmrl.latent=4", "run.episodes=3")
-Call = Callable[..., tuple[int, str, str]]
 
 
 class GoalController(Controller):
@@ -270,12 +269,7 @@ def test_a_run_without_checkpoint_cannot_be_evaluated(trained: Path, tmp_path: P
 
 @pytest.fixture
 def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    def call(*arguments: object) -> tuple[int, str, str]:
-        code = run(tcmrl, [str(each) for each in arguments])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
+    return in_process(tcmrl, capsys)
 
 
 def test_evaluate_command_prints_the_documented_json(trained: Path, call: Call) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import torch
-from tcmrl_cli.frame import run
 from tcmrl_cli.train import tcmrl
 
 import tcmrl_algo
@@ -17,6 +16,7 @@ from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
 from tcmrl_algo.config import TrainingSettings
 from tcmrl_algo.train import Progress
 from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
+from tests.commands import Call, assert_refused, in_process
 
 SMALL = (
     "run.log_every=10",
@@ -29,7 +29,6 @@ SMALL = (
     "tcmrl.estimator_hidden=[8]",
 )
 Train = Callable[..., tcmrl_algo.TrainingReport]
-Call = Callable[..., tuple[int, str, str]]
 
 
 def config_of(dataset: Dataset, *overrides: str, algorithm: str | None = None) -> TrainingConfig:
@@ -50,25 +49,7 @@ def start(tiny: Dataset, tmp_path: Path) -> Train:
 
 @pytest.fixture
 def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    """Runs `tcmrl` in this process: exit code, standard output, standard error."""
-
-    def call(*arguments: object) -> tuple[int, str, str]:
-        code = run(tcmrl, [str(each) for each in arguments])
-        captured = capsys.readouterr()
-        return code, captured.out, captured.err
-
-    return call
-
-
-def assert_refused(result: tuple[int, str, str], *expected: str) -> None:
-    code, output, errors = result
-    assert code == 2
-    assert output == ""
-    lines = errors.strip().splitlines()
-    assert len(lines) == 1, lines
-    assert lines[0].startswith("Error: ")
-    for text in expected:
-        assert text in lines[0]
+    return in_process(tcmrl, capsys)
 
 
 def test_recipe_values_reach_the_run(tiny: Dataset) -> None:
