@@ -3,7 +3,8 @@
     python benchmarks/behavior_training.py [--quick] [--seconds 10]
 
 A task-step is one environment step of one task and its update, in the real environment; the warm-up is
-passed before the clock starts. Both sides run with one thread, in float32, in this process; seconds are CPU
+passed before the clock starts. Both sides run with one thread, in this process, in float32 but
+for the rows of precision `medium`; seconds are CPU
 seconds of the process, so that other load on the machine counts little. Each `sac` row stands beside the
 `stacked` rows of the same setting.
 """
@@ -25,8 +26,15 @@ from tcmrl_data.checkpoints import CheckpointFolder
 from tcmrl_data.tasks import choose_tasks
 from tcmrl_data.unit import behavior_source
 
-SETTINGS = [("point-robot-wind", 64, 128), ("half-cheetah-vel", 64, 128), ("half-cheetah-vel", 256, 256)]
+SETTINGS = [
+    ("point-robot-wind", 64, 128),
+    ("half-cheetah-vel", 64, 128),
+    ("half-cheetah-vel", 128, 128),
+    ("half-cheetah-vel", 256, 256),
+]
 GROUPS = [1, 4, 16, 50]
+MEDIUM_GROUP = 16
+"""Agents of the row that is measured again with matrix products in reduced precision."""
 WARMUP = 300
 SETTLING = 40
 """Steps with updates before the clock starts."""
@@ -67,8 +75,8 @@ def measure(recipe: Recipe, num_tasks: int, seconds: float) -> float:
     return (last - first) / (ended - begun)
 
 
-def recipe_of(name: str, source: str, width: int, batch_size: int) -> Recipe:
-    """The environment's recipe with the network and batch of a setting."""
+def recipe_of(name: str, source: str, width: int, batch_size: int, *more: str) -> Recipe:
+    """The environment's recipe with the network and batch of a setting, and more overrides."""
     settings = {
         "hidden": [width, width],
         "batch_size": batch_size,
@@ -77,8 +85,8 @@ def recipe_of(name: str, source: str, width: int, batch_size: int) -> Recipe:
         "snapshots": [0, 1_000_000],
         "buffer_size": 20_000,
     }
-    overrides = [f"behavior.{source}.{key}={value}" for key, value in settings.items()]
-    return load_recipe(name, behavior=source, overrides=overrides)
+    overrides = [f"behavior.sac.{key}={value}" for key, value in settings.items()]
+    return load_recipe(name, behavior=source, overrides=[*overrides, *more])
 
 
 def rows(seconds: float, groups: list[int]) -> Iterator[dict[str, Any]]:
@@ -86,11 +94,18 @@ def rows(seconds: float, groups: list[int]) -> Iterator[dict[str, Any]]:
     for name, width, batch_size in SETTINGS:
         setting = {"environment": name, "width": width, "batch_size": batch_size}
         base = measure(recipe_of(name, "sac", width, batch_size), 1, seconds)
-        yield setting | {"source": "sac", "tasks": 1, "task_steps_per_second": base, "times_sac": 1.0}
-        for num_tasks in groups:
-            rate = measure(recipe_of(name, "stacked", width, batch_size), num_tasks, seconds)
+        yield setting | {
+            "source": "sac",
+            "tasks": 1,
+            "precision": "highest",
+            "task_steps_per_second": base,
+            "times_sac": 1.0,
+        }
+        for num_tasks, precision in [*((each, "highest") for each in groups), (MEDIUM_GROUP, "medium")]:
+            override = f"behavior.stacked.matmul_precision={precision}"
+            rate = measure(recipe_of(name, "stacked", width, batch_size, override), num_tasks, seconds)
             measured = {"task_steps_per_second": rate, "times_sac": rate / base}
-            yield setting | {"source": "stacked", "tasks": num_tasks} | measured
+            yield setting | {"source": "stacked", "tasks": num_tasks, "precision": precision} | measured
 
 
 def main() -> None:

@@ -1,5 +1,7 @@
 """Groups of tasks trained in lockstep: streams, resuming, units, and what their snapshots are."""
 
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -16,10 +18,11 @@ from tcmrl_data.behavior.stacked_sac import Settings, Source, _make_training
 from tcmrl_data.canonical import canonical_json
 from tcmrl_data.checkpoints import CheckpointFolder
 from tcmrl_data.errors import BuildError
-from tcmrl_data.manifest import read_manifest
-from tcmrl_data.publish import CHECKPOINTS
+from tcmrl_data.manifest import part_folder, read_manifest
+from tcmrl_data.publish import CHECKPOINTS, make_folders
 from tcmrl_data.snapshot import Snapshot
 from tcmrl_data.tasks import choose_tasks, group_tasks
+from tcmrl_data.unit import UnitSpec, unit_memory
 
 TINY = (
     "behavior.stacked.group=4",
@@ -270,6 +273,49 @@ def test_a_diverged_agent_reaches_no_other(tmp_path: Path, monkeypatch: pytest.M
         False,
         True,
     ]
+
+
+def test_reduced_precision_is_recorded_with_its_error_and_left_behind_at_once(tmp_path: Path) -> None:
+    recipe = recipe_of(overrides=(*TINY, "behavior.stacked.matmul_precision=medium"))
+    assert source_of(recipe_of()).provenance() == {}
+    tcmrl_data.build_dataset(recipe, tmp_path / "dataset", tasks=[1, 2], workers=1)
+    recorded = open_dataset(tmp_path / "dataset").part(1, 130).provenance["behavior"]
+    assert recorded["matmul_precision"] == "medium"
+    assert 0 < recorded["matmul_error"] < 0.05  # of a product's standard deviation; bfloat16 gives 0.013
+    snapshots = source_of(recipe).snapshots(context_of(recipe, [1, 2], tmp_path))
+    assert {torch.get_float32_matmul_precision() for _ in snapshots} == {"highest"}
+
+
+def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
+    """Its own process, with checkpoints at every look at the clock; what they hold dominates."""
+    overrides = (
+        "behavior.sac.hidden=[384,384]",
+        "behavior.sac.steps=200",
+        "behavior.sac.buffer_size=200",
+        "behavior.sac.warmup=195",
+        "behavior.sac.snapshots=[0,200]",
+        "behavior.stacked.group=20",
+        "rollouts.episodes=10",
+    )
+    recipe = load_recipe("half-cheetah-vel", profile="quick", overrides=overrides, behavior="stacked")
+    make_folders(tmp_path / "tasks")
+    tasks = choose_tasks(recipe, range(20))
+    for task in tasks:
+        make_folders((tmp_path / part_folder(task.index, 0)).parent)
+    spec = canonical_json(UnitSpec(tmp_path, recipe, 0, tasks).to_json()).decode()
+    program = (
+        "import json, resource, sys\n"
+        "from tcmrl_data import checkpoints\n"
+        "from tcmrl_data.unit import UnitSpec, run_unit\n"
+        "checkpoints.CheckpointFolder.is_due = lambda self: True\n"
+        "run_unit(UnitSpec.from_json(json.load(sys.stdin)), lambda message: None)\n"
+        "print(1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], input=spec, capture_output=True, text=True, check=True
+    )
+    planned = unit_memory(recipe, len(tasks))
+    assert 0.4 * planned < int(done.stdout) < planned
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")

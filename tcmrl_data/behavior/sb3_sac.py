@@ -114,18 +114,20 @@ class Source(BehaviorSource):
 
 
 def training_bytes(settings: Settings, environment: Environment, *, num_agents: int) -> int:
-    """Most memory that training some agents at once takes: replay buffers, networks, activations.
+    """Most memory that training some agents at once takes.
 
-    The replay buffers count three times, since a checkpoint is a copy of them and its file another.
+    What a checkpoint keeps (replay buffers, weights and their moments) counts three times: the checkpoint
+    is a copy of it and the file another.
     """
     observation_dim, action_dim = environment.observation_dim, environment.action_dim
     row = 2 * observation_dim + action_dim + 3
     replay = min(settings.buffer_size, settings.steps) * row
     actor = _parameters(observation_dim, settings.hidden, 2 * action_dim)
     critic = _parameters(observation_dim + action_dim, settings.hidden, 1)
-    networks = 4 * actor + 2 * 5 * critic  # with gradients and two moments; critics with targets too
+    kept = replay + 3 * actor + 2 * 4 * critic  # weights and two moments; the critics' targets
+    gradients = actor + 2 * critic
     activations = 8 * settings.batch_size * (row + sum(settings.hidden))  # both critics, forward and backward
-    return 4 * num_agents * (3 * replay + networks + activations)
+    return 4 * num_agents * (3 * kept + gradients + activations)
 
 
 def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
