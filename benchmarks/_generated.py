@@ -1,0 +1,80 @@
+"""Datasets of random numbers in any size, published as real ones are; for benchmarks only."""
+
+from pathlib import Path
+
+import numpy as np
+
+import tcmrl_data
+from tcmrl_data.driver import Driver, make_groups
+from tcmrl_data.environment import Environment
+from tcmrl_data.manifest import References, part_folder
+from tcmrl_data.publish import publish_folder
+from tcmrl_data.snapshot import ScriptedPolicy, Snapshot
+from tcmrl_data.tasks import Task, choose_tasks
+from tcmrl_data.trajectory import Trajectory
+from tcmrl_data.unit import UnitSpec, seal_part
+
+STEPS = 10_000
+"""Environment steps between two snapshots."""
+
+
+def generate_dataset(
+    folder: Path, environment_name: str, *, tasks: int, snapshots: int, episodes: int, seed: int = 0
+) -> int:
+    """Writes a dataset of training tasks whose episodes are white noise of the full horizon.
+
+    Every file is made, digested and published by the code that builds datasets; only the simulation and
+    the policy training are left out. Noise compresses worse than physics does.
+
+    Args:
+        folder: where; a dataset of the same arguments is taken as it is.
+        environment_name: gives observation and action size and the horizon.
+        tasks: training tasks, the first of the task set.
+        snapshots: parts per task.
+        episodes: per part.
+        seed: of the noise.
+
+    Returns:
+        The number of transitions.
+    """
+    steps = [STEPS * i for i in range(snapshots)]
+    overrides = (
+        f"behavior.sac.snapshots={steps}",
+        f"behavior.sac.steps={max(steps[-1], STEPS)}",
+        f"rollouts.episodes={episodes}",
+        "rollouts.lanes=1",
+    )
+    recipe = tcmrl_data.load_recipe(environment_name, overrides=overrides, behavior="sac")
+    chosen = [task for task in choose_tasks(recipe) if task.split == "train"][:tasks]
+    spec = UnitSpec(folder, recipe, seed, tuple(chosen))
+    environment = recipe.make_environment()
+    make_groups(folder, chosen)
+    for task in chosen:
+        for step in steps:
+            if not (folder / part_folder(task.index, step)).is_dir():
+                _publish(spec, environment, task, step)
+    Driver(recipe, folder, seed, chosen).write_manifest()
+    return len(chosen) * snapshots * episodes * environment.settings.horizon
+
+
+def _publish(spec: UnitSpec, environment: Environment, task: Task, step: int) -> None:
+    random = np.random.default_rng([spec.seed, task.index, step])
+    trajectories = [_noise(random, environment) for _ in range(spec.recipe.rollouts.episodes)]
+    snapshot = Snapshot(step, ScriptedPolicy(observation="stored", noise=1.0))
+    references = References(uniform=-1.0, oracle=0.0, scripted=None)
+    _, files = seal_part(spec, environment, task, snapshot, trajectories, references)
+    publish_folder(spec.dataset, spec.dataset / part_folder(task.index, step), files, attempt="generated")
+
+
+def _noise(random: np.random.Generator, environment: Environment) -> Trajectory:
+    steps = environment.settings.horizon
+    truncated = np.zeros(steps, dtype=bool)
+    truncated[-1] = True
+    return Trajectory(
+        random.standard_normal((steps + 1, environment.observation_dim), dtype=np.float32),
+        random.uniform(-1, 1, (steps, environment.action_dim)).astype(np.float32),
+        random.standard_normal(steps, dtype=np.float32),
+        np.zeros(steps, dtype=bool),
+        truncated,
+        {name: np.zeros(steps, dtype) for name, dtype in environment.extras.items()},
+    )
