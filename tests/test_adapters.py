@@ -219,7 +219,8 @@ def test_minari_knows_the_scores_and_makes_the_task_again(
     tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     minari = pytest.importorskip("minari")
-    minari_format.export(tiny, tmp_path / "out", snapshots="last")
+    monkeypatch.chdir(tmp_path)
+    minari_format.export(tiny, Path("out"), snapshots="last")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
     opened = minari.load_dataset("tcmrl/point-robot/task00040-last-v0")
     references = tiny.references(40)

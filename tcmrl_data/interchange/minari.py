@@ -107,7 +107,7 @@ def make_task(settings: Mapping[str, Any], parameters: Mapping[str, Any]) -> gym
 def _datasets_path(folder: Path) -> Iterator[None]:
     """Makes a folder the root of Minari's datasets; Minari takes it from the process's environment only."""
     before = os.environ.get("MINARI_DATASETS_PATH")
-    os.environ["MINARI_DATASETS_PATH"] = str(folder)
+    os.environ["MINARI_DATASETS_PATH"] = str(folder.resolve())  # Minari trips over a relative one
     try:
         yield
     finally:

@@ -3,12 +3,12 @@
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from tcmrl_data.dataset import Selection
 from tcmrl_data.errors import MissingPackageError
 
 if TYPE_CHECKING:
+    import torch
     from tensordict import TensorDict
 
     from tcmrl_data.sampler import Steps
@@ -34,6 +34,8 @@ def to_tensordict(selection: Selection) -> "TensorDict":
         >>> buffer = ReplayBuffer(storage=LazyTensorStorage(len(data)), sampler=sampler)  # doctest: +SKIP
         >>> buffer.extend(data)  # doctest: +SKIP
     """
+    import torch
+
     kind = _tensordict_type()
     episodes = [
         (task.index, step, trajectory)
@@ -43,10 +45,10 @@ def to_tensordict(selection: Selection) -> "TensorDict":
     ]
     lengths = [len(each) for _, _, each in episodes]
 
-    def flat(arrays: list[Any]) -> torch.Tensor:
+    def flat(arrays: list[Any]) -> "torch.Tensor":
         return torch.from_numpy(np.concatenate(arrays))
 
-    def numbered(numbers: list[int]) -> torch.Tensor:
+    def numbered(numbers: list[int]) -> "torch.Tensor":
         return torch.from_numpy(np.repeat(np.array(numbers, dtype=np.int64), lengths))
 
     result: TensorDict = kind(
@@ -78,6 +80,8 @@ def view_steps(steps: "Steps") -> "TensorDict":
     Raises:
         MissingPackageError: tensordict is not installed.
     """
+    import torch
+
     kind = _tensordict_type()
     terminated = steps.terminated.bool()
     result: TensorDict = kind(
@@ -99,8 +103,11 @@ _FLAGS = ("done", "terminated", "truncated")
 
 
 def _outcome(
-    observations: torch.Tensor, rewards: torch.Tensor, terminated: torch.Tensor, truncated: torch.Tensor
-) -> dict[str, torch.Tensor]:
+    observations: "torch.Tensor",
+    rewards: "torch.Tensor",
+    terminated: "torch.Tensor",
+    truncated: "torch.Tensor",
+) -> dict[str, "torch.Tensor"]:
     """What follows an action: the `next` entries."""
     return {
         "observation": observations,
