@@ -36,9 +36,8 @@ class TrajectoryDataset(Dataset[Item]):
 
     Example:
         >>> from torch.utils.data import DataLoader
-        >>> from tcmrl_data.torch_dataset import collate
         >>> episodes = dataset.to_torch_dataset(split="train")  # doctest: +SKIP
-        >>> loader = DataLoader(episodes, batch_size=16, shuffle=True, collate_fn=collate)  # doctest: +SKIP
+        >>> DataLoader(episodes, batch_size=16, shuffle=True, collate_fn=episodes.collate)  # doctest: +SKIP
     """
 
     def __init__(self, selection: "Selection", *, kept_parts: int | None = None) -> None:
@@ -67,18 +66,18 @@ class TrajectoryDataset(Dataset[Item]):
             self._read.popitem(last=False)
         return found
 
-
-def collate(items: Sequence[Item]) -> Item:
-    """Items as one batch: arrays padded at the end with zeros, and `mask` (N, longest), False on padding."""
-    batch = {
-        name: torch.stack([item[name] for item in items])
-        if items[0][name].ndim == 0
-        else pad_sequence([item[name] for item in items], batch_first=True)
-        for name in items[0]
-    }
-    lengths = torch.tensor([len(item["actions"]) for item in items])
-    batch["mask"] = torch.arange(int(lengths.max())) < lengths[:, None]
-    return batch
+    @staticmethod
+    def collate(items: Sequence[Item]) -> Item:
+        """Items as one batch: arrays padded with zeros at the end; `mask` (N, longest) is False there."""
+        batch = {
+            name: torch.stack([item[name] for item in items])
+            if items[0][name].ndim == 0
+            else pad_sequence([item[name] for item in items], batch_first=True)
+            for name in items[0]
+        }
+        lengths = torch.tensor([len(item["actions"]) for item in items])
+        batch["mask"] = torch.arange(int(lengths.max())) < lengths[:, None]
+        return batch
 
 
 def _item(trajectory: Trajectory, task: int, step: int) -> Item:

@@ -17,7 +17,6 @@ from tcmrl_data.errors import MissingPackageError, SelectionError, StoreError
 from tcmrl_data.interchange import minari as minari_format
 from tcmrl_data.interchange.sb3_buffer import to_sb3_buffer
 from tcmrl_data.interchange.tensordict import to_tensordict, view_steps
-from tcmrl_data.torch_dataset import collate
 from tests.conftest import TASKS
 
 
@@ -101,7 +100,7 @@ def test_torch_dataset_reads_lazily_and_keeps_what_it_may(
 def test_a_loader_with_a_worker_pads_to_the_longest(tiny: Dataset, uneven: None) -> None:
     served = tiny.to_torch_dataset(tasks=[40], snapshots="last")
     pickle.loads(pickle.dumps(served))  # a worker that is spawned gets it so
-    (batch,) = DataLoader(served, batch_size=6, collate_fn=collate, num_workers=1)
+    (batch,) = DataLoader(served, batch_size=6, collate_fn=served.collate, num_workers=1)
     assert batch["observations"].shape == (6, 21, 2)
     assert batch["rewards"].shape == batch["mask"].shape == (6, 20)
     assert batch["mask"].sum(1).tolist() == [20, 19, 18, 17, 16, 15]
