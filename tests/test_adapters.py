@@ -12,7 +12,7 @@ import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 from torch.utils.data import DataLoader
 
-from tcmrl_data import BatchSizes, Dataset, Selection, Trajectory
+from tcmrl_data import BatchSizes, Dataset, Purpose, Selection, Trajectory, keyed_seed
 from tcmrl_data.errors import MissingPackageError, SelectionError, StoreError
 from tcmrl_data.interchange import minari as minari_format
 from tcmrl_data.interchange.sb3_buffer import to_sb3_buffer
@@ -233,10 +233,11 @@ def test_minari_knows_the_scores_and_makes_the_task_again(
     assert {each.partition("==")[0] for each in metadata["requirements"]} >= {"tcmrl", "gymnasium"}
     environment = opened.recover_environment(eval_env=True)
     episode = opened[0]
-    (episode_metadata,) = opened.storage.get_episode_metadata([0])
-    np.testing.assert_allclose(
-        environment.reset(seed=episode_metadata["seed"])[0], episode.observations[0], atol=1e-6
-    )
+    seeds = [each["seed"] for each in opened.storage.get_episode_metadata(range(6))]
+    assert seeds == [
+        keyed_seed(0, "point-robot", 40, Purpose.ROLLOUT_RESET, 150, index) for index in range(6)
+    ]
+    np.testing.assert_allclose(environment.reset(seed=seeds[0])[0], episode.observations[0], atol=1e-6)
     for action, observation, reward in zip(
         episode.actions, episode.observations[1:], episode.rewards, strict=True
     ):
