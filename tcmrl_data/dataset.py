@@ -263,10 +263,6 @@ class Selection:
     tasks: tuple[Task, ...]
     steps: dict[int, tuple[int, ...]]
 
-    def trajectories(self, task: int) -> list[Trajectory]:
-        """All selected episodes of a task, snapshot by snapshot."""
-        return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
-
     def to_torch_dataset(self, *, kept_parts: int | None = None) -> "TrajectoryDataset":
         """The selected episodes as a map-style `torch.utils.data.Dataset`; parts are read when asked for.
 
@@ -276,6 +272,10 @@ class Selection:
         from tcmrl_data.torch_dataset import TrajectoryDataset
 
         return TrajectoryDataset(self, kept_parts=kept_parts)
+
+    def trajectories(self, task: int) -> list[Trajectory]:
+        """All selected episodes of a task, snapshot by snapshot."""
+        return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
 
     def sampler(self, sizes: "BatchSizes", *, seed: int, device: str = "cpu") -> "Sampler":
         """Loads the selection once and serves meta-training batches from it.
