@@ -106,7 +106,7 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
 
 @data.command()
 @click.argument("dataset", type=click.Path(path_type=Path))
-@click.option("--format", "format_name", required=True, metavar="NAME", help="The format: hdf5.")
+@click.option("--format", "format_name", required=True, metavar="NAME", help="The format: hdf5 or minari.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
@@ -126,12 +126,14 @@ def export(
 ) -> None:
     """Write DATASET in another format.
 
-    DATASET is a folder or its manifest.json; every task becomes one file in a new folder.
+    DATASET is a folder or its manifest.json. In a new folder, every task becomes one HDF5 file or one
+    Minari dataset; Minari opens them by name when MINARI_DATASETS_PATH names the folder.
 
     \b
     Examples:
       tcmrl-data export data/point-robot --format hdf5
-      tcmrl-data export data/point-robot --format hdf5 --snapshots last --out flat
+      tcmrl-data export data/point-robot --format minari --snapshots last --out minari
+      MINARI_DATASETS_PATH=minari minari list local
     """
     import tcmrl_data
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from tcmrl_data.build import BuildReport, build_dataset
     from tcmrl_data.canonical import canonical_json, parse_json
-    from tcmrl_data.dataset import Dataset, Selection, list_datasets, open_dataset
+    from tcmrl_data.dataset import Dataset, Selection, open_dataset
     from tcmrl_data.discovery import plugin
     from tcmrl_data.environment import (
         Controller,
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from tcmrl_data.errors import CheckpointError, SelectionError, TcmrlError, TrainingError
     from tcmrl_data.events import BuildEvent, BuildStatus, build_status
     from tcmrl_data.garbage import Garbage, collect_garbage
+    from tcmrl_data.listing import list_datasets
     from tcmrl_data.manifest import Manifest
     from tcmrl_data.plan import Plan, plan_build
     from tcmrl_data.recipe import (
@@ -47,7 +48,7 @@ if TYPE_CHECKING:
 _HOMES = {
     "build": ("BuildReport", "build_dataset"),
     "canonical": ("canonical_json", "parse_json"),
-    "dataset": ("Dataset", "Selection", "list_datasets", "open_dataset"),
+    "dataset": ("Dataset", "Selection", "open_dataset"),
     "discovery": ("plugin",),
     "environment": (
         "Controller",
@@ -60,6 +61,7 @@ _HOMES = {
     "events": ("BuildEvent", "BuildStatus", "build_status"),
     "errors": ("CheckpointError", "SelectionError", "TcmrlError", "TrainingError"),
     "garbage": ("Garbage", "collect_garbage"),
+    "listing": ("list_datasets",),
     "manifest": ("Manifest",),
     "plan": ("Plan", "plan_build"),
     "recipe": ("PROFILES", "Recipe", "apply_overrides", "first_problem", "list_environments", "load_recipe"),

@@ -33,6 +33,7 @@ from tcmrl_data.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from tcmrl_data.sampler import BatchSizes, Sampler
+    from tcmrl_data.torch_dataset import TrajectoryDataset
 
 
 def open_dataset(path: str | Path) -> "Dataset":
@@ -208,6 +209,18 @@ class Dataset:
             self, tuple(chosen), {task.index: self._steps(task.index, snapshots) for task in chosen}
         )
 
+    def to_torch_dataset(
+        self,
+        *,
+        split: Split | None = None,
+        tasks: Sequence[int] | None = None,
+        snapshots: str = "all",
+        kept_parts: int | None = None,
+    ) -> "TrajectoryDataset":
+        """`select(...)`, then `Selection.to_torch_dataset`."""
+        selection = self.select(split=split, tasks=tasks, snapshots=snapshots)
+        return selection.to_torch_dataset(kept_parts=kept_parts)
+
     def _steps(self, task: int, rule: str) -> tuple[int, ...]:
         steps = self.snapshots(task)
         missing = sorted(set(self.manifest.steps) - set(steps))
@@ -250,6 +263,16 @@ class Selection:
     tasks: tuple[Task, ...]
     steps: dict[int, tuple[int, ...]]
 
+    def to_torch_dataset(self, *, kept_parts: int | None = None) -> "TrajectoryDataset":
+        """The selected episodes as a map-style `torch.utils.data.Dataset`; parts are read when asked for.
+
+        Args:
+            kept_parts: parts that stay in memory after they were read; all of them where None.
+        """
+        from tcmrl_data.torch_dataset import TrajectoryDataset
+
+        return TrajectoryDataset(self, kept_parts=kept_parts)
+
     def trajectories(self, task: int) -> list[Trajectory]:
         """All selected episodes of a task, snapshot by snapshot."""
         return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
@@ -270,28 +293,3 @@ class Selection:
                 f"meta-training needs at least 2 training tasks, the selection has {len(self.tasks)}"
             )
         return Sampler(self, sizes, seed=seed, device=device)
-
-
-def list_datasets(root: str | Path) -> list[dict[str, Any]]:
-    """The datasets below a folder: name, tasks, parts, complete, root, path; unreadable ones with `error`."""
-    rows: list[dict[str, Any]] = []
-    for file in sorted(Path(root).glob(f"**/{MANIFEST}")):
-        try:
-            manifest = read_manifest(file)
-        except ManifestError as error:
-            rows.append({"path": str(file.parent), "error": str(error)})
-            continue
-        rows.append(
-            {
-                "path": str(file.parent),
-                "name": manifest.name,
-                "profile": manifest.profile,
-                "behavior": manifest.recipe.behavior["source"],
-                "seed": manifest.seed,
-                "tasks": len(manifest.tasks),
-                "parts": len(manifest.parts),
-                "complete": manifest.complete,
-                "root": manifest.root,
-            }
-        )
-    return rows

@@ -68,7 +68,7 @@ class Driver:
         tasks_of = {_unit_id(group): group for group in groups}
         units = [self._unit(group) for group in groups]
         self._steps_total = self._source.training_steps * sum(len(group) for group in groups)
-        _make_groups(self._out, missing)
+        make_groups(self._out, missing)
         failures: list[str] = []
         try:
             self.write_manifest()
@@ -207,7 +207,7 @@ def _failure(result: Result) -> str:
     return f"{result.id} failed after {result.attempt} attempt(s) on {result.node}: {result.error}"
 
 
-def _make_groups(out: Path, tasks: Sequence[Task]) -> None:
+def make_groups(out: Path, tasks: Sequence[Task]) -> None:
     """Makes the folders above the parts groups of one Zarr hierarchy."""
     folders = [out, out / "tasks"]
     for task in tasks:

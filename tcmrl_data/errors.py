@@ -53,6 +53,10 @@ class NondeterminismError(BuildError):
     """The same unit settings and seeds gave different data."""
 
 
+class MissingPackageError(TcmrlError):
+    """An optional package that is not installed; the message names the extra that brings it."""
+
+
 class CheckpointError(TcmrlError):
     """A training run that cannot be opened or resumed."""
 

@@ -1,6 +1,6 @@
 """The making of a part: a snapshot's rollouts, their record, and their publication."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
@@ -93,43 +93,23 @@ class PartMaker:
 
     def _make(self, snapshot: Snapshot) -> tuple[str, dict[str, bytes]]:
         """The id and all files of the snapshot's part."""
-        environment, recipe = self._environment, self._recipe
+        environment, task = self._environment, self.task
         if self._lanes is None:
             self._lanes = environment.lanes(self._parameters)
         trajectories = roll_out_part(
-            recipe, self._seed, environment=environment, task=self.task, snapshot=snapshot, lanes=self._lanes
+            self._recipe, self._seed, environment=environment, task=task, snapshot=snapshot, lanes=self._lanes
         )
         if self._references is None:
             self._references = self._measure_references()
-        arrays = pack(trajectories)
-        digests = {
-            name: ArrayRecord.model_validate_json(canonical_json(each))
-            for name, each in array_digests(arrays).items()
-        }
-        identity = Identity(
-            schema_version=SCHEMA_VERSION,
-            data_version=DATA_VERSION,
-            settings=recipe.unit_settings(),
-            task=self.task.index,
-            parameters=dict(self.task.parameters),
-            step=snapshot.step,
-            seed=self._seed,
-            policy=snapshot.digest(),
-            arrays=digests,
-        )
-        files = encode_arrays(arrays) | snapshot.files()
-        record = PartRecord(
-            schema_version=SCHEMA_VERSION,
-            id=digest(identity.model_dump(mode="json")),
-            identity=identity,
-            statistics=statistics(trajectories),
+        return seal_part(
+            self._recipe,
+            self._seed,
+            task=task,
+            snapshot=snapshot,
+            trajectories=trajectories,
             references=self._references,
-            files={
-                name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())
-            },
             provenance=provenance(environment, self._behavior),
         )
-        return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}
 
     def _measure_references(self) -> References:
         """Uniform, oracle and noise-free scripted returns of the task, from one lane batch each."""
@@ -152,6 +132,46 @@ class PartMaker:
             oracle=mean_return(environment.oracle(self._parameters)),
             scripted=mean_return(environment.scripted(self._parameters, 0.0)),
         )
+
+
+def seal_part(
+    recipe: Recipe,
+    seed: int,
+    *,
+    task: Task,
+    snapshot: Snapshot,
+    trajectories: Sequence[Trajectory],
+    references: References,
+    provenance: Mapping[str, Any],
+) -> tuple[str, dict[str, bytes]]:
+    """The id and all files of a part, `part.json` included."""
+    arrays = pack(trajectories)
+    digests = {
+        name: ArrayRecord.model_validate_json(canonical_json(each))
+        for name, each in array_digests(arrays).items()
+    }
+    identity = Identity(
+        schema_version=SCHEMA_VERSION,
+        data_version=DATA_VERSION,
+        settings=recipe.unit_settings(),
+        task=task.index,
+        parameters=dict(task.parameters),
+        step=snapshot.step,
+        seed=seed,
+        policy=snapshot.digest(),
+        arrays=digests,
+    )
+    files = encode_arrays(arrays) | snapshot.files()
+    record = PartRecord(
+        schema_version=SCHEMA_VERSION,
+        id=digest(identity.model_dump(mode="json")),
+        identity=identity,
+        statistics=statistics(trajectories),
+        references=references,
+        files={name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())},
+        provenance=dict(provenance),
+    )
+    return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}
 
 
 def part_bytes(recipe: Recipe) -> int:

@@ -47,11 +47,12 @@ def loaded_after(code: str, *arguments: str) -> set[str]:
         ["inspect", "tasks", "DATASET"],
         ["inspect", "snapshots", "DATASET"],
         ["inspect", "episodes", "DATASET"],
+        ["export", "DATASET", "--format", "hdf5", "--out", "OUT"],
     ],
     ids=" ".join,
 )
-def test_looking_at_data_loads_nothing_heavy(arguments: list[str], tiny_folder: Path) -> None:
-    places = {"PARENT": str(tiny_folder.parent), "DATASET": str(tiny_folder)}
+def test_looking_at_data_loads_nothing_heavy(arguments: list[str], tiny_folder: Path, tmp_path: Path) -> None:
+    places = {"PARENT": str(tiny_folder.parent), "DATASET": str(tiny_folder), "OUT": str(tmp_path / "out")}
     code = (
         "from tcmrl_cli.data import data\n"
         "from tcmrl_cli.frame import run\n"

@@ -13,8 +13,6 @@ dataset it came from.
 """
 
 import json
-import shutil
-import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +22,7 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset import Dataset, Selection
 from tcmrl_data.errors import StoreError
-from tcmrl_data.publish import move_into_place, sync_tree
+from tcmrl_data.interchange._new_folder import new_folder
 from tcmrl_data.tasks import Task
 from tcmrl_data.trajectory import Trajectory
 
@@ -62,23 +60,13 @@ def export(
         StoreError: `out` exists and is not empty.
     """
     selection = dataset.select(snapshots=snapshots)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise StoreError(f"--out {out} exists and is not empty; choose another folder or remove it")
     total = sum(len(steps) for steps in selection.steps.values())
-    out.parent.mkdir(parents=True, exist_ok=True)
-    staged = out.with_name(f".{out.name}.{uuid.uuid4().hex}.partial")
-    staged.mkdir()
-    try:
-        done = 0
+    done = 0
+    with new_folder(out) as folder:
         for task in selection.tasks:
-            for _ in _write_task(selection, task, staged / _file_name(task)):
+            for _ in _write_task(selection, task, folder / _file_name(task)):
                 done += 1
                 progress(done, total)
-        sync_tree(staged)
-        if not move_into_place(staged, out):
-            raise StoreError(f"--out {out} appeared meanwhile; choose another folder or remove it")
-    finally:
-        shutil.rmtree(staged, ignore_errors=True)
     return [out / _file_name(task) for task in selection.tasks]
 
 

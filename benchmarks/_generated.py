@@ -1,0 +1,89 @@
+"""Datasets of random numbers in any size, published as real ones are; for benchmarks only."""
+
+from pathlib import Path
+
+import numpy as np
+
+import tcmrl_data
+from tcmrl_data.driver import Driver, make_groups
+from tcmrl_data.environment import Environment
+from tcmrl_data.manifest import References, part_folder
+from tcmrl_data.part import seal_part
+from tcmrl_data.provenance import provenance
+from tcmrl_data.publish import publish_folder
+from tcmrl_data.recipe import Recipe
+from tcmrl_data.snapshot import ScriptedPolicy, Snapshot
+from tcmrl_data.tasks import Task, choose_tasks
+from tcmrl_data.trajectory import Trajectory
+
+STEPS = 10_000
+"""Environment steps between two snapshots."""
+
+
+def generate_dataset(
+    folder: Path, environment_name: str, *, tasks: int, snapshots: int, episodes: int, seed: int = 0
+) -> int:
+    """Writes a dataset of training tasks whose episodes are white noise of the full horizon.
+
+    Every file is made, digested and published by the code that builds datasets; only the simulation and
+    the policy training are left out. Noise compresses worse than physics does.
+
+    Args:
+        folder: where; a dataset of the same arguments is taken as it is.
+        environment_name: gives observation and action size and the horizon.
+        tasks: training tasks, the first of the task set.
+        snapshots: parts per task.
+        episodes: per part.
+        seed: of the noise.
+
+    Returns:
+        The number of transitions.
+    """
+    steps = [STEPS * i for i in range(snapshots)]
+    overrides = (
+        f"behavior.sac.snapshots={steps}",
+        f"behavior.sac.steps={max(steps[-1], STEPS)}",
+        f"rollouts.episodes={episodes}",
+        "rollouts.lanes=1",
+    )
+    recipe = tcmrl_data.load_recipe(environment_name, overrides=overrides, behavior="sac")
+    chosen = [task for task in choose_tasks(recipe) if task.split == "train"][:tasks]
+    environment = recipe.make_environment()
+    make_groups(folder, chosen)
+    for task in chosen:
+        for step in steps:
+            if not (folder / part_folder(task.index, step)).is_dir():
+                _publish(folder, recipe, task, step, seed=seed)
+    Driver(recipe, folder, seed, chosen).write_manifest()
+    return len(chosen) * snapshots * episodes * environment.settings.horizon
+
+
+def _publish(folder: Path, recipe: Recipe, task: Task, step: int, *, seed: int) -> None:
+    environment = recipe.make_environment()
+    random = np.random.default_rng([seed, task.index, step])
+    trajectories = [_noise(random, environment) for _ in range(recipe.rollouts.episodes)]
+    snapshot = Snapshot(step, ScriptedPolicy(observation="stored", noise=1.0))
+    _, files = seal_part(
+        recipe,
+        seed,
+        task=task,
+        snapshot=snapshot,
+        trajectories=trajectories,
+        references=References(uniform=-1.0, oracle=0.0, scripted=None),
+        provenance=provenance(environment, {"generated": "white noise"}),
+    )
+    publish_folder(folder, folder / part_folder(task.index, step), files, attempt="generated")
+
+
+def _noise(random: np.random.Generator, environment: Environment) -> Trajectory:
+    steps = environment.settings.horizon
+    truncated = np.zeros(steps, dtype=bool)
+    truncated[-1] = True
+    return Trajectory(
+        random.standard_normal((steps + 1, environment.observation_dim), dtype=np.float32),
+        random.uniform(-1, 1, (steps, environment.action_dim)).astype(np.float32),
+        random.standard_normal(steps, dtype=np.float32),
+        np.zeros(steps, dtype=bool),
+        truncated,
+        {name: np.zeros(steps, dtype) for name, dtype in environment.extras.items()},
+    )
