@@ -89,6 +89,6 @@ def test_the_largest_q_is_that_of_any_critic_and_row() -> None:
     actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
     rows = actor_critic.rows(steps(TASKS, 5, seed=1), torch.zeros(TASKS, 0))
     with torch.no_grad():
-        actor_critic.critics.biases[-1][1].fill_(-500.0)
+        actor_critic.critics.members[1].layers[-1].bias.fill_(-500.0)
     _, metrics = actor_critic.losses(rows, torch.Generator().manual_seed(0))
     assert metrics["actor_critic/largest_q"].item() == pytest.approx(500.0, abs=5.0)
