@@ -41,7 +41,9 @@ def tcmrl() -> None:
 
 @tcmrl.command()
 @click.argument("manifest", metavar="MANIFEST", type=click.Path(path_type=Path))
-@click.option("--algo", metavar="NAME", help="tcmrl, or its control no_context; the recipe's if left out.")
+@click.option(
+    "--algo", metavar="NAME", help="tcmrl, focal, or the blind no_context; the recipe's if left out."
+)
 @click.option(
     "--profile",
     type=click.Choice(get_args(Profile)),

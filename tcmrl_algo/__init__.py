@@ -7,6 +7,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tcmrl_algo.aggregate import Summary, summarize
     from tcmrl_algo.checkpoint import Run, RunRecord, open_run
     from tcmrl_algo.config import TrainingConfig, TrainingSettings, resolve
     from tcmrl_algo.context_algorithm import ContextAlgorithm
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
     from tcmrl_algo.train import Progress, TrainingReport, create_algorithm, resume_run, train_run
 
 _HOMES = {
+    "aggregate": ("Summary", "summarize"),
     "checkpoint": ("Run", "RunRecord", "open_run"),
     "config": ("TrainingConfig", "TrainingSettings", "resolve"),
     "context_algorithm": ("ContextAlgorithm",),
@@ -32,6 +34,7 @@ __all__ = [
     "Progress",
     "Run",
     "RunRecord",
+    "Summary",
     "TaskResult",
     "TrainingConfig",
     "TrainingReport",
@@ -41,6 +44,7 @@ __all__ = [
     "open_run",
     "resolve",
     "resume_run",
+    "summarize",
     "train_run",
 ]
 

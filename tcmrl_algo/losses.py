@@ -8,7 +8,7 @@ over real entries, so that loss weights mean the same for short and long episode
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -142,7 +142,9 @@ def info_nce(
         mask: which tasks exist at a position. The others are in no denominator there.
         temperature: tau.
     """
-    logits = torch.einsum("...id,...ld->...il", queries, keys) / temperature
+    # contiguous, mask included: otherwise products fall back to one small product per position
+    queries, keys, mask = queries.contiguous(), keys.contiguous(), mask.contiguous()
+    logits = queries @ keys.mT / temperature
     logits = torch.where(mask.unsqueeze(-2), logits, -torch.inf)
     present = mask & (mask.sum(dim=-1, keepdim=True) > 1)  # a lone task has nothing to be told apart from
     logits = torch.where(present.unsqueeze(-1), logits, 0.0)  # keeps rows without any key free of NaN
@@ -175,35 +177,31 @@ def task_contrastive_loss(
     if representations.shape[2] < window_length:
         return (representations * 0.0).sum() + (similarity * 0.0).sum()
     last = window_length - 1
-    windows = representations.unfold(2, window_length, 1)  # tasks trajectories positions latent K
-    priors = windows[..., :last].mean(dim=-1)
+    flat = representations[:, :, :-1].flatten(0, 1).transpose(1, 2)  # every step but the last begins a prior
+    priors = functional.avg_pool1d(flat, last, stride=1).transpose(1, 2)
     return info_nce(
-        (priors @ similarity).permute(1, 2, 0, 3),
-        windows[..., last].permute(1, 2, 0, 3),
+        (priors @ similarity).unflatten(0, representations.shape[:2]).permute(1, 2, 0, 3),
+        representations[:, :, last:].permute(1, 2, 0, 3),
         mask[:, :, last:].permute(1, 2, 0),  # padding is at the end: the last step being real suffices
         temperature=temperature,
     )
 
 
-def distance_metric_loss(
-    contexts: Float[Tensor, "contexts latent"],
-    tasks: Int[Tensor, " contexts"],
-    *,
-    epsilon: float = 0.1,
-) -> Scalar:
+def distance_metric_loss(contexts: Float[Tensor, "tasks examples latent"], *, epsilon: float = 0.1) -> Scalar:
     """FOCAL's distance-metric loss (Li et al., 2021), inverse square: gathers each task's contexts.
 
     L = mean over pairs of one task of d^2 + mean over pairs of two tasks of 1 / (d^2 + epsilon), with
-    d^2 = |c_i - c_j|^2 / latent. Not in the paper; in its published code.
+    d^2 = |c_i - c_j|^2 / latent. Not in TCMRL's paper; in its published code.
 
     Args:
         contexts: several contexts of every task.
-        tasks: the task each of them belongs to.
         epsilon: bounds the repulsion (published code: 0.1).
     """
-    squares = (contexts.unsqueeze(0) - contexts.unsqueeze(1)).square().mean(dim=-1)
+    flat = contexts.flatten(0, 1)
+    squares = (flat.unsqueeze(0) - flat.unsqueeze(1)).square().mean(dim=-1)
+    tasks = torch.arange(len(contexts), device=flat.device).repeat_interleave(contexts.shape[1])
     same = tasks.unsqueeze(0) == tasks.unsqueeze(1)
-    pairs = ~torch.eye(len(tasks), dtype=torch.bool, device=tasks.device)
+    pairs = ~torch.eye(len(tasks), dtype=torch.bool, device=flat.device)
     return masked_mean(squares, same & pairs) + masked_mean(1.0 / (squares + epsilon), ~same)
 
 

@@ -15,7 +15,6 @@ from tcmrl_data import (
     Purpose,
     Task,
     Trajectory,
-    UniformController,
     keyed_generator,
     keyed_seed,
     roll_out,
@@ -88,14 +87,17 @@ class Arena:
             found += self._run(tasks[lanes], controller, episode=episode, first_lane=start)
         return found
 
-    def uniform(self, tasks: Sequence[Task], *, episode: int) -> list[Trajectory]:
-        """One episode per lane of uniform actions."""
-        return self._run(tasks, UniformController(), episode=episode, first_lane=0)
+    def explored(
+        self, tasks: Sequence[Task], collected: Sequence[Context], *, episode: int
+    ) -> list[Trajectory]:
+        """One episode per lane by the method's exploration, uniform actions unless it has its own."""
+        return self._run(tasks, self._algorithm.explore(collected), episode=episode, first_lane=0)
 
     def stored(self, task: Task, *, draw: int) -> Context:
         """Stored trajectories of a task, `offline_trajectories` of them, drawn without replacement."""
         if task.index not in self._stored:
-            selection = self.dataset.select(tasks=[task.index], snapshots=self.settings.snapshots)
+            snapshots = self.settings.context_snapshots or self.settings.snapshots
+            selection = self.dataset.select(tasks=[task.index], snapshots=snapshots)
             self._stored[task.index] = selection.trajectories(task.index)
         stored = self._stored[task.index]
         number = min(self.settings.offline_trajectories, len(stored))
@@ -146,7 +148,7 @@ def adapt_paper(arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
     collected: list[list[Trajectory]] = [[] for _ in tasks]
     for episode in range(settings.episodes):
         if episode < num_random:
-            trajectories = arena.uniform(tasks, episode=episode)
+            trajectories = arena.explored(tasks, collected, episode=episode)
         else:
             trajectories = arena.adapted(tasks, collected, episode=episode)
         for lane, trajectory in zip(collected, trajectories, strict=True):

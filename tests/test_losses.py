@@ -57,8 +57,8 @@ DIFFERENTIABLE: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
         (random(2, 1, 3, 4), random(4, 4, seed=1)),
     ),
     "distance_metric": (
-        lambda c: losses.distance_metric_loss(c, torch.tensor([0, 0, 1])),
-        (random(3, 4),),
+        lambda c: losses.distance_metric_loss(c),
+        (random(2, 2, 4),),
     ),
     "orthogonality": (losses.orthogonality_loss, (random(2, 3),)),
     "q": (
@@ -171,6 +171,20 @@ def test_task_contrastive_loss_by_hand() -> None:
     assert loss.item() == pytest.approx(-sum(terms) / 4, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("order", "expected"),
+    [([0, 1, 2], math.log(1 + 2 * math.exp(-4))), ([1, 2, 0], math.log(2 + math.exp(4)))],
+    ids=["perfect", "shuffled"],
+)
+def test_contrastive_loss_of_aligned_and_of_shuffled_tasks(order: list[int], expected: float) -> None:
+    """Priors are 2 e_i; targets are the same, or those of the next task: logits 4 for one task, 0 for two."""
+    priors = 2.0 * torch.eye(3, dtype=torch.float64)
+    representations = torch.stack([priors, priors[order]], dim=1).unsqueeze(1)
+    mask, similarity = torch.ones(3, 1, 2, dtype=torch.bool), torch.eye(3, dtype=torch.float64)
+    loss = losses.task_contrastive_loss(representations, mask, similarity, window_length=2)
+    assert loss.item() == pytest.approx(expected, rel=1e-12)
+
+
 def test_prior_is_the_mean_of_all_but_the_last_representation() -> None:
     representations = random(2, 1, 3, 4).detach()
     mask = torch.ones(2, 1, 3, dtype=torch.bool)
@@ -204,9 +218,9 @@ def test_contrastive_loss_of_episodes_shorter_than_a_window_is_zero() -> None:
 
 
 def test_distance_metric_by_hand() -> None:
-    contexts = torch.tensor([[0.0, 0.0], [2.0, 0.0], [0.0, 4.0]])
-    loss = losses.distance_metric_loss(contexts, torch.tensor([0, 0, 1]), epsilon=0.5)
-    expected = 2.0 + (1 / 8.5 + 1 / 10.5) / 2  # d^2 is 4/2 within; 16/2 and 20/2 between
+    contexts = torch.tensor([[[0.0, 0.0], [2.0, 0.0]], [[0.0, 4.0], [0.0, 4.0]]])
+    loss = losses.distance_metric_loss(contexts, epsilon=0.5)
+    expected = (2.0 + 0.0) / 2 + (1 / 8.5 + 1 / 10.5) / 2  # d^2: 4/2 and 0 within; 16/2 and 20/2 between
     assert loss.item() == pytest.approx(expected, rel=1e-6)
 
 

@@ -1,0 +1,47 @@
+"""What is said across seeds, and what is not."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from tcmrl_algo import Summary, summarize
+from tcmrl_data import TrainingError
+
+
+def test_fewer_than_five_seeds_get_no_interval_but_stand_there() -> None:
+    found = summarize([1.0, 2.0, 6.0, 3.0])
+    assert (found.low, found.high) == (None, None)
+    assert (found.mean, found.iqm) == (3.0, 2.5)  # without 1 and 6
+    assert str(found) == "3 (seeds: 1, 2, 6, 3)"
+
+
+def test_interval_is_that_of_all_equally_likely_resamples() -> None:
+    values = [0.0, 1.0, 2.0, 4.0, 13.0]
+    found = summarize(values)
+    means = [np.mean(each) for each in itertools.product(values, repeat=5)]  # all 3,125 resamples
+    low, high = np.quantile(means, [0.025, 0.975])
+    assert found.low == pytest.approx(low, abs=0.2)
+    assert found.high == pytest.approx(high, abs=0.2)
+    assert found.mean == 4.0
+    assert found.iqm == pytest.approx(7 / 3)
+    assert str(found) == f"4 [{found.low:.3g}, {found.high:.3g}]"
+
+
+def test_a_summary_is_a_function_of_its_values() -> None:
+    values = [0.5, 0.1, 0.9, 0.3, 0.7, 0.2]
+    np.random.seed(1)
+    first = summarize(values)
+    np.random.seed(2)
+    assert summarize(values) == first
+    assert first.values == tuple(values)
+
+
+def test_equal_values_have_an_interval_of_no_width() -> None:
+    assert summarize([2.0] * 6) == Summary((2.0,) * 6, 2.0, 2.0, 2.0, 2.0)
+
+
+@pytest.mark.parametrize("values", [[], [1.0, float("nan")], [float("inf")] * 6])
+def test_what_cannot_be_summarised_is_refused(values: list[float]) -> None:
+    with pytest.raises(TrainingError, match="finite"):
+        summarize(values)
