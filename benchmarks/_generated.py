@@ -49,7 +49,9 @@ def generate(name: str, folder: Path, *, tasks: int, snapshots: int) -> Dataset:
                 spec, environment, task=task, snapshot=_snapshot(environment, step),
                 trajectories=episodes, references=References(uniform=0.0, oracle=None, scripted=None),
             )  # fmt: skip
-            publish_folder(folder, folder / part_folder(task.index, step), files, attempt=f"task_{task.index}")
+            publish_folder(
+                folder, folder / part_folder(task.index, step), files, attempt=f"task_{task.index}"
+            )
     Driver(recipe, folder, 0, chosen).write_manifest()
     return open_dataset(folder)
 

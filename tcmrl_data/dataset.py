@@ -254,12 +254,19 @@ class Selection:
         """All selected episodes of a task, snapshot by snapshot."""
         return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
 
-    def sampler(self, sizes: "BatchSizes", *, seed: int, device: str = "cpu") -> "Sampler":
+    def sampler(self, sizes: "BatchSizes", *, seed: int, stream: int = 0, device: str = "cpu") -> "Sampler":
         """Loads the selection once and serves meta-training batches from it.
+
+        Args:
+            sizes: what a batch holds.
+            seed: of the run; batch n is a function of (seed, stream, n).
+            stream: further streams of batches under the same seed.
+            device: where batches are to be.
 
         Raises:
             SelectionError: the selection holds test tasks, fewer than two tasks, or too little of one.
         """
+        from tcmrl_data.rows import read_rows
         from tcmrl_data.sampler import Sampler
 
         test = [task.index for task in self.tasks if task.split == "test"]
@@ -269,7 +276,15 @@ class Selection:
             raise SelectionError(
                 f"meta-training needs at least 2 training tasks, the selection has {len(self.tasks)}"
             )
-        return Sampler(self, sizes, seed=seed, device=device)
+        return Sampler(
+            read_rows(self),
+            sizes,
+            seed=seed,
+            stream=stream,
+            environment=self.dataset.name,
+            place=str(self.dataset.folder),
+            device=device,
+        )
 
 
 def list_datasets(root: str | Path) -> list[dict[str, Any]]:

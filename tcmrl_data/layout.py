@@ -227,7 +227,8 @@ Metadata = TypeVar("Metadata", bound=_Metadata)
 
 def _read_metadata(kind: type[Metadata], file: Path) -> Metadata:
     try:
-        return _parse_metadata(kind, read_plain_file(file, limit=METADATA_BYTES))
+        metadata: Metadata = _parse_metadata(kind, read_plain_file(file, limit=METADATA_BYTES))
+        return metadata
     except ValidationError as error:
         detail = error.errors()[0]
         field = ".".join(map(str, detail["loc"])) or "values"

@@ -1,4 +1,4 @@
-"""Parts on disk: the only file that imports zarr or its codecs. Trajectories in, flat chunked arrays out, and back.
+"""Parts on disk: the only file that imports zarr or its codecs. Trajectories in, flat arrays out, and back.
 
 A part is a Zarr v3 group. Steps of all episodes lie flat behind one another with `episode_offsets`;
 observations hold one row more per episode, so that row `offset[e] + e + t` is o_t of episode e and
@@ -131,17 +131,17 @@ def array_files(folder: Path, name: str) -> list[str]:
 
 
 def _read_files(folder: Path, layout: ArrayLayout) -> dict[str, bytes]:
-    """The content of an array's files, chunks checked to be of their declared size."""
+    """The content of an array's chunk files, checked to be of their declared size."""
     limit = 2**16 + layout.chunk_bytes + layout.chunk_bytes // 64
     contents = {}
-    for name in layout.files():
+    for name in layout.files()[1:]:  # the first is zarr.json, which the layout came from
         try:
             contents[name] = data = read_plain_file(folder / name, limit=limit)
         except FileNotFoundError:
             raise StoreError(f"{folder / name} is missing; run `tcmrl-data repair`") from None
         except (OSError, ValueError) as error:
             raise StoreError(f"{folder / name}: {one_line(error)}") from None
-        problem = None if name.endswith("zarr.json") else chunk_problem(layout, data)
+        problem = chunk_problem(layout, data)
         if problem:
             raise StoreError(f"{folder / name} {problem}; run `tcmrl-data repair`")
     return contents

@@ -191,7 +191,11 @@ class _TaskRoller:
         if self._references is None:
             self._references = self._measure_references()
         return part_files(
-            spec, environment, task=self.task, snapshot=snapshot, trajectories=trajectories,
+            spec,
+            environment,
+            task=self.task,
+            snapshot=snapshot,
+            trajectories=trajectories,
             references=self._references,
         )
 
@@ -260,9 +264,7 @@ def part_files(
         identity=identity,
         statistics=statistics(trajectories),
         references=references,
-        files={
-            name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())
-        },
+        files={name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())},
         provenance=provenance(environment),
     )
     return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}

@@ -1,0 +1,183 @@
+"""From rows to a batch: one gather of blocks of rows per kind, into memory that is used again."""
+
+import weakref
+from collections import deque
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from tcmrl_data.batch import Batch, BatchSizes, Steps
+from tcmrl_data.draws import Draw
+from tcmrl_data.rows import Rows, Table
+
+SPARE_BUFFERS = 8
+"""Buffers kept for later batches; more exist while more batches are held."""
+
+PINNED_BUFFERS = 4
+DEVICE_SHARE = 0.5
+"""Of a device's free memory, the most that rows may take there."""
+
+
+class Gatherer:
+    """Fetches a drawn batch.
+
+    K steps and the observation behind them are one stretch of the table, so a view whose rows overlap
+    (row i: the block that starts at row i) gives a transition, a window or a trajectory by one index.
+    """
+
+    def __init__(self, rows: Rows, sizes: BatchSizes, *, num_tasks: int, device: torch.device) -> None:
+        self._rows, self._device = rows, device
+        self._width, self._longest = rows.table.shape[1], rows.episodes.longest
+        self._is_ragged = bool((rows.episodes.lengths != self._longest).any())
+        step = self._width + rows.observation_dim
+        window = sizes.window_length * self._width + rows.observation_dim
+        trajectory = (self._longest + 1) * self._width
+        table = torch.from_numpy(rows.table)
+        if device.type == "cuda" and table.nbytes <= DEVICE_SHARE * torch.cuda.mem_get_info(device)[0]:
+            table = table.to(device)
+        self._views = [_overlapping(table, floats) for floats in (step, window, trajectory)]
+        most = max(sizes.context_trajectories) + sizes.execution_trajectories
+        each_task = sizes.transitions * step + sizes.windows * window + most * trajectory
+        self._buffers: _HostBuffers | _PinnedBuffers | _DeviceBuffers
+        if device.type == "cuda":
+            kind = _DeviceBuffers if table.is_cuda else _PinnedBuffers
+            self._buffers = kind(num_tasks * each_task, device)
+        else:
+            self._buffers = _HostBuffers(num_tasks * each_task, device)
+        self._masks: dict[tuple[int, ...], Tensor] = {}
+        self._window_length = sizes.window_length
+
+    def __call__(self, draw: Draw) -> Batch:
+        """The batch of a draw, on the device."""
+        starts = self._rows.episodes.starts[draw.trajectories]
+        memory = self._buffers.take()
+        ends, end = [0], 0
+        for view, rows in zip(self._views, (draw.transitions, draw.windows, starts), strict=True):
+            end += rows.size * view.shape[1]
+            block = memory[ends[-1] : end].view(rows.size, view.shape[1])
+            torch.index_select(view, 0, torch.from_numpy(rows.reshape(-1)).to(memory.device), out=block)
+            ends.append(end)
+        mask = self._trajectory_mask(draw, memory[ends[2] : end])
+        memory = self._buffers.hand_out(memory)
+        num_context = draw.num_context
+        lead, block_floats = draw.trajectories.shape, self._views[2].shape[1]
+        context = (lead[0], num_context, self._longest)
+        execution = (lead[0], lead[1] - num_context, self._longest)
+        strides = (lead[1] * block_floats, block_floats, self._width)
+        windows = (*draw.windows.shape, self._window_length)
+        return Batch(
+            task_indices=torch.from_numpy(self._rows.task_indices[draw.tasks]),
+            transitions=self._steps(memory, 0, draw.transitions.shape, self._strides(draw.transitions, 0)),
+            context=self._steps(memory, ends[2], context, strides, mask[:, :num_context]),
+            execution=self._steps(
+                memory, ends[2] + num_context * block_floats, execution, strides, mask[:, num_context:]
+            ),
+            windows=self._steps(memory, ends[1], windows, (*self._strides(draw.windows, 1), self._width)),
+        )
+
+    def _strides(self, rows: np.typing.NDArray[np.int64], kind: int) -> tuple[int, int]:
+        floats = self._views[kind].shape[1]
+        return rows.shape[1] * floats, floats
+
+    def _steps(
+        self,
+        memory: Tensor,
+        offset: int,
+        shape: tuple[int, ...],
+        strides: tuple[int, ...],
+        mask: Tensor | None = None,
+    ) -> Steps:
+        """Steps of a shape, whose rows lie in `memory` from `offset` on, the given strides apart."""
+        observation_dim, action_dim = self._rows.observation_dim, self._rows.action_dim
+        last = offset + self._width - 1
+        observations = ((*shape, observation_dim), (*strides, 1))
+        return Steps(
+            observations=memory.as_strided(*observations, offset),
+            actions=memory.as_strided((*shape, action_dim), (*strides, 1), offset + observation_dim),
+            rewards=memory.as_strided(shape, strides, last - 1),
+            next_observations=memory.as_strided(*observations, offset + self._width),
+            terminated=memory.as_strided(shape, strides, last),
+            mask=self._all_true(shape) if mask is None else mask,
+        )
+
+    def _trajectory_mask(self, draw: Draw, block: Tensor) -> Tensor:
+        """(tasks, trajectories, longest episode); clears in the gathered block what follows an episode."""
+        shape = (*draw.trajectories.shape, self._longest)
+        if not self._is_ragged:
+            return self._all_true(shape)
+        lengths = torch.from_numpy(self._rows.episodes.lengths[draw.trajectories]).to(block.device)[..., None]
+        t = torch.arange(self._longest + 1, device=block.device)
+        rows = block.view(*shape[:2], self._longest + 1, self._width)
+        rows.masked_fill_((t > lengths)[..., None], 0.0)
+        return (t[:-1] < lengths).to(self._device)
+
+    def _all_true(self, shape: tuple[int, ...]) -> Tensor:
+        """A mask without padding; one for all batches."""
+        if shape not in self._masks:
+            self._masks[shape] = torch.ones(shape, dtype=torch.bool, device=self._device)
+        return self._masks[shape]
+
+
+def _overlapping(table: Tensor, floats: int) -> Tensor:
+    """(rows, floats): the block of that many floats from each row on that has one."""
+    width = table.shape[1]
+    rows = max(0, (table.numel() - floats) // width + 1)
+    return table.as_strided((rows, floats), (width, 1))
+
+
+class _HostBuffers:
+    """Memory that comes back by itself when the last tensor over it is gone."""
+
+    def __init__(self, floats: int, device: torch.device) -> None:
+        self._floats, self._device = floats, device
+        self._spare: deque[Table] = deque(maxlen=SPARE_BUFFERS)
+
+    def take(self) -> Tensor:
+        try:
+            memory = self._spare.pop()
+        except IndexError:
+            memory = np.empty(self._floats, dtype=np.float32)
+        lease = memory[:]  # a new object over the same memory, which torch holds as long as it needs it
+        weakref.finalize(lease, self._spare.append, memory).atexit = False
+        return torch.from_numpy(lease)
+
+    def hand_out(self, memory: Tensor) -> Tensor:
+        return memory.to(self._device)
+
+
+class _DeviceBuffers:
+    """Memory of the device, where its own allocator uses it again."""
+
+    def __init__(self, floats: int, device: torch.device) -> None:
+        self._floats, self._device = floats, device
+
+    def take(self) -> Tensor:
+        return torch.empty(self._floats, device=self._device)
+
+    def hand_out(self, memory: Tensor) -> Tensor:
+        return memory
+
+
+class _PinnedBuffers:
+    """Page-locked memory, copied to the device without waiting; filled again once it has been copied."""
+
+    def __init__(self, floats: int, device: torch.device) -> None:
+        self._device = device
+        self._free = deque(
+            (torch.empty(floats, pin_memory=True), torch.cuda.Event()) for _ in range(PINNED_BUFFERS)
+        )
+        self._copied: dict[int, torch.cuda.Event] = {}
+
+    def take(self) -> Tensor:
+        memory, copied = self._free.popleft()
+        copied.synchronize()  # the oldest copy: long done
+        self._copied[memory.data_ptr()] = copied
+        return memory
+
+    def hand_out(self, memory: Tensor) -> Tensor:
+        result = memory.to(self._device, non_blocking=True)
+        copied = self._copied.pop(memory.data_ptr())
+        copied.record(torch.cuda.current_stream(self._device))
+        self._free.append((memory, copied))
+        return result
