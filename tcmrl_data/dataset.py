@@ -2,7 +2,7 @@
 
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -254,7 +254,16 @@ class Selection:
         """All selected episodes of a task, snapshot by snapshot."""
         return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
 
-    def sampler(self, sizes: "BatchSizes", *, seed: int, stream: int = 0, device: str = "cpu") -> "Sampler":
+    def sampler(
+        self,
+        sizes: "BatchSizes",
+        *,
+        seed: int,
+        stream: int = 0,
+        device: str = "cpu",
+        memory_limit: int | None = None,
+        say: Callable[[str], None] = lambda message: None,
+    ) -> "Sampler":
         """Loads the selection once and serves meta-training batches from it.
 
         Args:
@@ -262,11 +271,14 @@ class Selection:
             seed: of the run; batch n is a function of (seed, stream, n).
             stream: further streams of batches under the same seed.
             device: where batches are to be.
+            memory_limit: bytes that the decoded steps may take in memory, half of what is available if left
+                out; larger selections are decoded into the cache once and read from there.
+            say: told when the cache is used.
 
         Raises:
             SelectionError: the selection holds test tasks, fewer than two tasks, or too little of one.
         """
-        from tcmrl_data.rows import read_rows
+        from tcmrl_data.cache import load_rows
         from tcmrl_data.sampler import Sampler
 
         test = [task.index for task in self.tasks if task.split == "test"]
@@ -277,7 +289,7 @@ class Selection:
                 f"meta-training needs at least 2 training tasks, the selection has {len(self.tasks)}"
             )
         return Sampler(
-            read_rows(self),
+            load_rows(self, memory_limit=memory_limit, say=say),
             sizes,
             seed=seed,
             stream=stream,
@@ -285,28 +297,3 @@ class Selection:
             place=str(self.dataset.folder),
             device=device,
         )
-
-
-def list_datasets(root: str | Path) -> list[dict[str, Any]]:
-    """The datasets below a folder: name, tasks, parts, complete, root, path; unreadable ones with `error`."""
-    rows: list[dict[str, Any]] = []
-    for file in sorted(Path(root).glob(f"**/{MANIFEST}")):
-        try:
-            manifest = read_manifest(file)
-        except ManifestError as error:
-            rows.append({"path": str(file.parent), "error": str(error)})
-            continue
-        rows.append(
-            {
-                "path": str(file.parent),
-                "name": manifest.name,
-                "profile": manifest.profile,
-                "behavior": manifest.recipe.behavior["source"],
-                "seed": manifest.seed,
-                "tasks": len(manifest.tasks),
-                "parts": len(manifest.parts),
-                "complete": manifest.complete,
-                "root": manifest.root,
-            }
-        )
-    return rows

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.batch import Moments
-from tcmrl_data.rows import Rows
+from tcmrl_data.rows import Episodes, Rows
 
 CHUNK_ROWS = 2**16
 SMALLEST_STD = 1e-6
@@ -16,14 +16,10 @@ def moments_of(rows: Rows) -> Moments:
     """Statistics over all transitions of the rows, in double precision."""
     table, episodes = rows.table, rows.episodes
     stop = int(episodes.starts[-1] + episodes.lengths[-1])
-    is_step = np.zeros(stop + 1, dtype=np.int8)
-    np.add.at(is_step, episodes.starts, 1)
-    np.add.at(is_step, episodes.starts + episodes.lengths, -1)
-    np.cumsum(is_step, out=is_step)
     width, total = rows.observation_dim, _Sums(2 * rows.observation_dim + rows.action_dim + 1)
     for first in range(0, stop, CHUNK_ROWS):
         last = min(first + CHUNK_ROWS, stop)
-        kept = is_step[first:last].astype(bool)
+        kept = _is_step(episodes, first, last)
         values = table[first:last][kept].astype(np.float64)
         following = table[first + 1 : last + 1, :width][kept]
         total.add(np.concatenate([following - values[:, :width], values[:, :-1]], axis=1))
@@ -43,6 +39,15 @@ def moments_of(rows: Rows) -> Moments:
         reward_max=float(total.most[reward]),
         longest_episode=episodes.longest,
     )
+
+
+def _is_step(episodes: Episodes, first: int, last: int) -> npt.NDArray[np.bool_]:
+    """Which of the rows first to last - 1 are transitions, and no episode's last row."""
+    rows = np.arange(first, last)
+    latest = np.searchsorted(episodes.starts, rows, side="right") - 1
+    ends = episodes.starts[latest] + episodes.lengths[latest]
+    result: npt.NDArray[np.bool_] = (latest >= 0) & (rows < ends)
+    return result
 
 
 class _Sums:

@@ -30,7 +30,6 @@ class Sampler:
     Attributes:
         sizes: what a batch holds.
         device: where batches are.
-        source: where the rows are, in words.
 
     Args:
         rows: the packed selection.
@@ -40,7 +39,6 @@ class Sampler:
         environment: its name, part of the seed's key.
         place: names the selection in errors.
         device: a torch device.
-        source: where the rows are, in words.
 
     Raises:
         SelectionError: a task has too few trajectories, or no window where windows are asked for.
@@ -56,9 +54,8 @@ class Sampler:
         environment: str,
         place: str,
         device: str = "cpu",
-        source: str = "memory",
     ) -> None:
-        self.sizes, self.device, self.source = sizes, torch.device(device), source
+        self.sizes, self.device = sizes, torch.device(device)
         self._rows = rows
         sequence = keyed_sequence(seed, environment, NO_TASK, Purpose.SAMPLER, stream)
         self._draws = Draws(rows.episodes, sizes, key=sequence.generate_state(2, np.uint64))
