@@ -1,99 +1,80 @@
-"""Datasets of a wanted size without training anyone: noise as episodes, published as a build publishes.
+"""Datasets of random numbers in any size, published as real ones are; for benchmarks only."""
 
-`python -m benchmarks._generated ENV FOLDER --tasks N --snapshots N`, or `generate` from another benchmark.
-"""
-
-import argparse
 from pathlib import Path
 
 import numpy as np
 
-from tcmrl_data import Dataset, Trajectory, load_recipe, open_dataset
+import tcmrl_data
 from tcmrl_data.driver import Driver, make_groups
 from tcmrl_data.environment import Environment
 from tcmrl_data.manifest import References, part_folder
 from tcmrl_data.publish import publish_folder
-from tcmrl_data.snapshot import GaussianPolicy, Snapshot
-from tcmrl_data.tasks import choose_tasks, draw_tasks
-from tcmrl_data.unit import UnitSpec, part_files
+from tcmrl_data.snapshot import ScriptedPolicy, Snapshot
+from tcmrl_data.tasks import Task, choose_tasks
+from tcmrl_data.trajectory import Trajectory
+from tcmrl_data.unit import UnitSpec, seal_part
 
-EPISODES = 50
-"""Per part, as the recipes of the paper have it."""
-
-SIZES = {"half-cheetah-vel": (20, 10), "ml1/reach": (40, 2)}
-"""Training tasks and snapshots that make 2 million transitions."""
+STEPS = 10_000
+"""Environment steps between two snapshots."""
 
 
-def generate(name: str, folder: Path, *, tasks: int, snapshots: int) -> Dataset:
-    """A dataset of `tasks` training tasks, each with `snapshots` parts of 50 episodes of full length.
+def generate_dataset(
+    folder: Path, environment_name: str, *, tasks: int, snapshots: int, episodes: int, seed: int = 0
+) -> int:
+    """Writes a dataset of training tasks whose episodes are white noise of the full horizon.
+
+    Every file is made, digested and published by the code that builds datasets; only the simulation and
+    the policy training are left out. Noise compresses worse than physics does.
 
     Args:
-        name: an environment with a recipe; its dimensions and horizon are used, its dynamics are not.
-        folder: a new folder.
-        tasks: training tasks; the first ones by index.
+        folder: where; a dataset of the same arguments is taken as it is.
+        environment_name: gives observation and action size and the horizon.
+        tasks: training tasks, the first of the task set.
         snapshots: parts per task.
+        episodes: per part.
+        seed: of the noise.
+
+    Returns:
+        The number of transitions.
     """
-    steps = [0, *range(10_000, 10_000 * snapshots, 10_000)]
-    overrides = (f"behavior.sac.snapshots={steps}", f"behavior.sac.steps={max(10_000, steps[-1])}")
-    recipe = load_recipe(name, overrides=overrides, behavior="sac")
+    steps = [STEPS * i for i in range(snapshots)]
+    overrides = (
+        f"behavior.sac.snapshots={steps}",
+        f"behavior.sac.steps={max(steps[-1], STEPS)}",
+        f"rollouts.episodes={episodes}",
+        "rollouts.lanes=1",
+    )
+    recipe = tcmrl_data.load_recipe(environment_name, overrides=overrides, behavior="sac")
+    chosen = [task for task in choose_tasks(recipe) if task.split == "train"][:tasks]
+    spec = UnitSpec(folder, recipe, seed, tuple(chosen))
     environment = recipe.make_environment()
-    train = [task.index for task in draw_tasks(environment) if task.split == "train"][:tasks]
-    chosen = choose_tasks(recipe, train)
     make_groups(folder, chosen)
-    spec = UnitSpec(folder, recipe, 0, tuple(chosen))
-    random = np.random.default_rng(0)
     for task in chosen:
         for step in steps:
-            episodes = [_episode(environment, random) for _ in range(EPISODES)]
-            _, files = part_files(
-                spec, environment, task=task, snapshot=_snapshot(environment, step),
-                trajectories=episodes, references=References(uniform=0.0, oracle=None, scripted=None),
-            )  # fmt: skip
-            publish_folder(
-                folder, folder / part_folder(task.index, step), files, attempt=f"task_{task.index}"
-            )
-    Driver(recipe, folder, 0, chosen).write_manifest()
-    return open_dataset(folder)
+            if not (folder / part_folder(task.index, step)).is_dir():
+                _publish(spec, environment, task, step)
+    Driver(recipe, folder, seed, chosen).write_manifest()
+    return len(chosen) * snapshots * episodes * environment.settings.horizon
 
 
-def _snapshot(environment: Environment, step: int) -> Snapshot:
-    """The smallest policy that a part can hold."""
-    description = GaussianPolicy(
-        observation="stored",
-        observation_dim=environment.observation_dim,
-        action_dim=environment.action_dim,
-        hidden=(1,),
-    )
-    zeros = {name: np.zeros(shape, dtype=np.float32) for name, shape in description.shapes().items()}
-    return Snapshot(step, description, zeros)
+def _publish(spec: UnitSpec, environment: Environment, task: Task, step: int) -> None:
+    random = np.random.default_rng([spec.seed, task.index, step])
+    trajectories = [_noise(random, environment) for _ in range(spec.recipe.rollouts.episodes)]
+    snapshot = Snapshot(step, ScriptedPolicy(observation="stored", noise=1.0))
+    references = References(uniform=-1.0, oracle=0.0, scripted=None)
+    _, files = seal_part(spec, environment, task, snapshot, trajectories, references)
+    publish_folder(spec.dataset, spec.dataset / part_folder(task.index, step), files, attempt="generated")
 
 
-def _episode(environment: Environment, random: np.random.Generator) -> Trajectory:
+def _noise(random: np.random.Generator, environment: Environment) -> Trajectory:
     steps = environment.settings.horizon
-    truncated = np.arange(1, steps + 1) == steps
+    truncated = np.zeros(steps, dtype=bool)
+    truncated[-1] = True
     return Trajectory(
         random.standard_normal((steps + 1, environment.observation_dim), dtype=np.float32),
         random.uniform(-1, 1, (steps, environment.action_dim)).astype(np.float32),
         random.standard_normal(steps, dtype=np.float32),
         np.zeros(steps, dtype=bool),
         truncated,
+        {name: np.zeros(steps, dtype) for name, dtype in environment.extras.items()},
     )
-
-
-def main() -> None:
-    """Generates one dataset; by default one of 2 million transitions."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("environment", choices=sorted(SIZES))
-    parser.add_argument("folder", type=Path)
-    parser.add_argument("--tasks", type=int)
-    parser.add_argument("--snapshots", type=int)
-    asked = parser.parse_args()
-    tasks, snapshots = SIZES[asked.environment]
-    dataset = generate(
-        asked.environment, asked.folder, tasks=asked.tasks or tasks, snapshots=asked.snapshots or snapshots
-    )
-    print(f"{dataset.folder}: {len(dataset.manifest.parts)} parts, root {dataset.manifest.root[:12]}")
-
-
-if __name__ == "__main__":
-    main()

@@ -14,10 +14,13 @@ from tcmrl_algo.checkpoint import Run, RunRecord, open_run, write_run
 from tcmrl_algo.config import ALGORITHMS, TrainingConfig, validated
 from tcmrl_algo.metrics import MetricsWriter
 from tcmrl_algo.problem import Algorithm, MomentsRecord, problem_of
-from tcmrl_data import BatchSizes, CheckpointError, Dataset, Sampler, TrainingError, plugin
+from tcmrl_data import BatchSizes, CheckpointError, Dataset, Prefetch, Sampler, TrainingError, plugin
 
 PACKAGES = ("torch", "numpy")
 """Whose versions results depend on."""
+
+PREFETCHED = 2
+"""Batches that wait ready; results do not depend on it."""
 
 
 @dataclass(frozen=True)
@@ -28,12 +31,14 @@ class Progress:
         step: steps done.
         steps: steps to do.
         rate: steps per second since the last report.
+        data_share: share of that time spent waiting for batches.
         metrics: of that step.
     """
 
     step: int
     steps: int
     rate: float
+    data_share: float
     metrics: Mapping[str, float]
 
 
@@ -58,6 +63,10 @@ def ignore(progress: Progress) -> None:
     """Reports nothing."""
 
 
+def keep_quiet(message: str) -> None:
+    """Says nothing."""
+
+
 def train_run(
     dataset: Dataset,
     out: str | Path,
@@ -67,7 +76,9 @@ def train_run(
     seed: int = 0,
     steps: int | None = None,
     device: str = "cpu",
+    memory_limit: int | None = None,
     report: Callable[[Progress], None] = ignore,
+    say: Callable[[str], None] = keep_quiet,
 ) -> TrainingReport:
     """Trains a new run.
 
@@ -79,7 +90,9 @@ def train_run(
         seed: of everything random.
         steps: where to stop, instead of `run.steps`; schedules keep the length that `run.steps` gives them.
         device: a torch device.
+        memory_limit: bytes of data beyond which the cache is used; half of the available memory if None.
         report: called after every logged step.
+        say: told where data are read from, where that is not memory.
 
     Raises:
         CheckpointError: the folder holds a run already.
@@ -93,7 +106,7 @@ def train_run(
     """
     if (Path(out) / "run.json").exists():
         raise CheckpointError(f"{out} holds a run already; go on with --resume, or name another --out")
-    batches = _batches(dataset, config, seed=seed, device=device)
+    batches = _batches(dataset, config, seed=seed, device=device, memory_limit=memory_limit, say=say)
     record = RunRecord(
         environment=dataset.name,
         dataset=str(dataset.folder.resolve()),
@@ -117,7 +130,9 @@ def resume_run(
     *,
     steps: int | None = None,
     device: str | None = None,
+    memory_limit: int | None = None,
     report: Callable[[Progress], None] = ignore,
+    say: Callable[[str], None] = keep_quiet,
 ) -> TrainingReport:
     """Goes on from a run's newest checkpoint; ends as an uninterrupted run of the same length would have.
 
@@ -126,7 +141,9 @@ def resume_run(
         dataset: the one it was trained on.
         steps: another place to stop.
         device: another device.
+        memory_limit: as for `train_run`.
         report: called after every logged step.
+        say: as for `train_run`.
 
     Raises:
         CheckpointError: no run, another dataset, or already further than `steps`.
@@ -139,7 +156,9 @@ def resume_run(
     start = run.checkpoints()[-1].step if run.checkpoints() else 0
     if start > record.steps:
         raise CheckpointError(f"{out} is at step {start} already, beyond --steps {record.steps}")
-    batches = _batches(dataset, record.config, seed=record.seed, device=record.device)
+    batches = _batches(
+        dataset, record.config, seed=record.seed, device=record.device, memory_limit=memory_limit, say=say
+    )
     algorithm = create_algorithm(record, dataset)
     if start:
         algorithm.load_tensors(run.newest().tensors())
@@ -177,13 +196,23 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
     return total.hexdigest()
 
 
-def _batches(dataset: Dataset, config: TrainingConfig, *, seed: int, device: str) -> Sampler:
+def _batches(
+    dataset: Dataset,
+    config: TrainingConfig,
+    *,
+    seed: int,
+    device: str,
+    memory_limit: int | None,
+    say: Callable[[str], None],
+) -> Sampler:
     """The stream of batches from the training tasks."""
     settings = config.settings
     module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
     selection = dataset.select(split="train", snapshots=settings.run.snapshots)
     sizes: BatchSizes = module.batch_sizes(settings)
-    return selection.sampler(sizes, seed=seed, device=str(_device(device)))
+    return selection.sampler(
+        sizes, seed=seed, device=str(_device(device)), memory_limit=memory_limit, say=say
+    )
 
 
 def _train(
@@ -197,18 +226,24 @@ def _train(
     """The loop: batch n - 1 makes step n."""
     settings, last = run.record.config.settings.run, run.record.steps
     began = time.perf_counter()
-    logged_at, logged_step = began, start
-    with MetricsWriter(run.folder, step=start) as writer:
+    logged_at, logged_step, logged_wait = began, start, 0.0
+    with (
+        MetricsWriter(run.folder, step=start) as writer,
+        Prefetch(batches.batch, range(start, last), depth=PREFETCHED) as stream,
+    ):
         for step in range(start + 1, last + 1):
-            metrics = algorithm.update(batches.batch(step - 1), step)
+            metrics = algorithm.update(next(stream), step)
             _check_finite(metrics, step)
             if step % settings.log_every == 0 or step == last:
                 values = {name: float(each) for name, each in metrics.items()}
                 now = time.perf_counter()
-                rate = (step - logged_step) / max(now - logged_at, 1e-9)
-                logged_at, logged_step = now, step
-                writer.write(step, values | {"time/steps_per_second": rate})
-                report(Progress(step, last, rate, values))
+                seconds = max(now - logged_at, 1e-9)
+                rate, share = (step - logged_step) / seconds, (stream.waited - logged_wait) / seconds
+                logged_at, logged_step, logged_wait = now, step, stream.waited
+                about = {"data/short_trajectories": float(batches.short_trajectories)}
+                times = {"time/steps_per_second": rate, "time/data_share": share}
+                writer.write(step, values | about | times)
+                report(Progress(step, last, rate, share, values))
             if step % settings.checkpoint_every == 0 or step == last:
                 _check_finite(algorithm.tensors(), step)
                 run.save(step, algorithm.tensors())

@@ -1,4 +1,4 @@
-"""The datasets below a folder, in one row each."""
+"""Which datasets lie below a folder."""
 
 from pathlib import Path
 from typing import Any

@@ -190,14 +190,7 @@ class _TaskRoller:
         trajectories = roll_out_part(spec, environment, self.task, snapshot, self._lanes)
         if self._references is None:
             self._references = self._measure_references()
-        return part_files(
-            spec,
-            environment,
-            task=self.task,
-            snapshot=snapshot,
-            trajectories=trajectories,
-            references=self._references,
-        )
+        return seal_part(spec, environment, self.task, snapshot, trajectories, self._references)
 
     def _measure_references(self) -> References:
         """Uniform, oracle and noise-free scripted returns of the task, from one lane batch each."""
@@ -222,25 +215,15 @@ class _TaskRoller:
         )
 
 
-def part_files(
+def seal_part(
     spec: UnitSpec,
     environment: Environment,
-    *,
     task: Task,
     snapshot: Snapshot,
     trajectories: Sequence[Trajectory],
     references: References,
 ) -> tuple[str, dict[str, bytes]]:
-    """The id and all files of the part that a snapshot and its episodes make.
-
-    Args:
-        spec: the unit; its recipe and seed go into the part's identity.
-        environment: where the episodes come from.
-        task: whose part it is.
-        snapshot: who acted in them.
-        trajectories: the episodes.
-        references: what the task's returns are held against.
-    """
+    """The id and all files of a part, `part.json` included."""
     arrays = pack(trajectories)
     digests = {
         name: ArrayRecord.model_validate_json(canonical_json(each))

@@ -177,6 +177,18 @@ def test_kept_batches_are_never_overwritten_and_dropped_ones_are_used_again(samp
     assert len(places) <= 2
 
 
+def test_tasks_depend_on_seed_and_number_alone(sampler: Sampler) -> None:
+    """Two samplers of one seed over the same tasks may be read side by side."""
+    fewer = SIZES.model_copy(
+        update={"transitions": 1, "context_trajectories": (0,), "execution_trajectories": 0, "windows": 0}
+    )
+    other = sampler_of(numbered_tasks([[9, 2]] * 3), fewer, seed=3)
+    for n in (0, 1, 17, 40):
+        batch = other.batch(n)
+        assert torch.equal(batch.task_indices, sampler.batch(n).task_indices)
+        assert batch.context.observations.shape == batch.execution.observations.shape == (3, 0, 9, 3)
+
+
 def test_streams_of_one_seed_differ(sampler: Sampler) -> None:
     first, second = (sampler_of(numbered_tasks(LENGTHS), SIZES, seed=3, stream=stream) for stream in (0, 1))
     assert torch.equal(first.batch(5).windows.rewards, sampler.batch(5).windows.rewards)
