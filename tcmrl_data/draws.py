@@ -57,13 +57,26 @@ class Starts:
         same = int(counts[0]) if len(counts) and (counts == counts[0]).all() else 0
         return cls(ends[:-1], episodes.starts, ends[episodes.task_ranges], same)
 
-    def rows(self, numbers: Indices) -> Indices:
-        """The rows that the numbers stand for, of the same shape."""
-        if self.per_episode:
-            episodes = numbers // self.per_episode
-        else:
-            episodes = np.searchsorted(self.before, numbers, side="right") - 1
-        result: Indices = self.first_rows[episodes] + (numbers - self.before[episodes])
+    def draw(self, tasks: Indices, uniform: Uniform) -> Indices:
+        """Rows uniform over each task's, one per number in [0, 1), (..., tasks, count).
+
+        Args:
+            tasks: (..., tasks) positions.
+            uniform: the numbers.
+        """
+        first, last = self.task_ranges[tasks][..., None, 0], self.task_ranges[tasks][..., None, 1]
+        if self.per_episode:  # an episode, and of what is left of the number a place in it
+            places = uniform * ((last - first) / self.per_episode)
+            drawn = places.astype(np.int64)
+            places -= drawn
+            places *= self.per_episode
+            drawn += first // self.per_episode
+            result: Indices = self.first_rows[drawn]
+            result += places.astype(np.int64)
+            return result
+        numbers = first + _below(uniform, last - first)
+        episodes = np.searchsorted(self.before, numbers, side="right") - 1
+        result = self.first_rows[episodes] + (numbers - self.before[episodes])
         return result
 
 
@@ -108,8 +121,8 @@ class Draws:
         choices = np.array(sizes.context_trajectories)
         context = choices[_below(random.random(BLOCK), len(choices))]
         shape = (BLOCK, self.num_tasks)
-        transitions = _rows(self._transitions, tasks, random.random((*shape, sizes.transitions)))
-        windows = _rows(self._windows, tasks, random.random((*shape, sizes.windows)))
+        transitions = self._transitions.draw(tasks, random.random((*shape, sizes.transitions)))
+        windows = self._windows.draw(tasks, random.random((*shape, sizes.windows)))
         most = int(choices.max()) + sizes.execution_trajectories
         trajectories = distinct(self._episode_ranges[tasks], random.random((*shape, most)))
         return [
@@ -140,12 +153,6 @@ def distinct(ranges: Indices, uniform: Uniform) -> Indices:
         picks[..., j] = pick
     result: Indices = picks + ranges[..., :1]
     return result
-
-
-def _rows(starts: Starts, tasks: Indices, uniform: Uniform) -> Indices:
-    """Rows uniform over each task's."""
-    first, last = starts.task_ranges[tasks][..., None, 0], starts.task_ranges[tasks][..., None, 1]
-    return starts.rows(first + _below(uniform, last - first))
 
 
 def _below(uniform: Uniform, counts: Indices | int) -> Indices:

@@ -2,6 +2,7 @@
 
 import weakref
 from collections import deque
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -17,6 +18,9 @@ SPARE_BUFFERS = 8
 PINNED_BUFFERS = 4
 DEVICE_SHARE = 0.5
 """Of a device's free memory, the most that rows may take there."""
+
+_Field = tuple[tuple[int, ...], tuple[int, ...], int]
+"""Size, strides and offset of a view."""
 
 
 class Gatherer:
@@ -45,7 +49,7 @@ class Gatherer:
             self._buffers = kind(num_tasks * each_task, device)
         else:
             self._buffers = _HostBuffers(num_tasks * each_task, device)
-        self._masks: dict[tuple[int, ...], Tensor] = {}
+        self._layouts: dict[int, list[tuple[list[_Field], Tensor]]] = {}
         self._window_length = sizes.window_length
 
     def __call__(self, draw: Draw) -> Batch:
@@ -58,65 +62,64 @@ class Gatherer:
             block = memory[ends[-1] : end].view(rows.size, view.shape[1])
             torch.index_select(view, 0, torch.from_numpy(rows.reshape(-1)).to(memory.device), out=block)
             ends.append(end)
-        mask = self._trajectory_mask(draw, memory[ends[2] : end])
+        mask = self._trajectory_mask(draw, memory[ends[2] : end]) if self._is_ragged else None
         memory = self._buffers.hand_out(memory)
-        num_context = draw.num_context
-        lead, block_floats = draw.trajectories.shape, self._views[2].shape[1]
-        context = (lead[0], num_context, self._longest)
-        execution = (lead[0], lead[1] - num_context, self._longest)
-        strides = (lead[1] * block_floats, block_floats, self._width)
-        windows = (*draw.windows.shape, self._window_length)
-        return Batch(
-            task_indices=torch.from_numpy(self._rows.task_indices[draw.tasks]),
-            transitions=self._steps(memory, 0, draw.transitions.shape, self._strides(draw.transitions, 0)),
-            context=self._steps(memory, ends[2], context, strides, mask[:, :num_context]),
-            execution=self._steps(
-                memory, ends[2] + num_context * block_floats, execution, strides, mask[:, num_context:]
-            ),
-            windows=self._steps(memory, ends[1], windows, (*self._strides(draw.windows, 1), self._width)),
+        transitions, windows, context, execution = (
+            self._steps(memory, fields, constant) for fields, constant in self._layout(draw, ends)
         )
+        if mask is not None:
+            context = replace(context, mask=mask[:, : draw.num_context])
+            execution = replace(execution, mask=mask[:, draw.num_context :])
+        tasks = torch.from_numpy(self._rows.task_indices[draw.tasks])
+        return Batch(tasks, transitions, context, execution, windows)
 
-    def _strides(self, rows: np.typing.NDArray[np.int64], kind: int) -> tuple[int, int]:
-        floats = self._views[kind].shape[1]
-        return rows.shape[1] * floats, floats
+    @staticmethod
+    def _steps(memory: Tensor, fields: list[_Field], mask: Tensor) -> Steps:
+        return Steps(*[memory.as_strided(*field) for field in fields], mask=mask)
 
-    def _steps(
-        self,
-        memory: Tensor,
-        offset: int,
-        shape: tuple[int, ...],
-        strides: tuple[int, ...],
-        mask: Tensor | None = None,
-    ) -> Steps:
-        """Steps of a shape, whose rows lie in `memory` from `offset` on, the given strides apart."""
+    def _layout(self, draw: Draw, ends: list[int]) -> list[tuple[list[_Field], Tensor]]:
+        """Fields of transitions, windows, context and execution, with masks; the same for equal sizes."""
+        if draw.num_context not in self._layouts:
+            step, window, trajectory = (view.shape[1] for view in self._views)
+            count, longest, width = draw.trajectories.shape[1], self._longest, self._width
+            split = ends[2] + draw.num_context * trajectory
+            windows = (draw.windows.shape[1] * window, window, width)
+            trajectories = (count * trajectory, trajectory, width)
+            tasks = len(draw.tasks)
+            self._layouts[draw.num_context] = [
+                self._fields(draw.transitions.shape, (draw.transitions.shape[1] * step, step), ends[0]),
+                self._fields((*draw.windows.shape, self._window_length), windows, ends[1]),
+                self._fields((tasks, draw.num_context, longest), trajectories, ends[2]),
+                self._fields((tasks, count - draw.num_context, longest), trajectories, split),
+            ]
+        return self._layouts[draw.num_context]
+
+    def _fields(
+        self, shape: tuple[int, ...], strides: tuple[int, ...], offset: int
+    ) -> tuple[list[_Field], Tensor]:
+        """Where the fields of steps lie whose rows lie in a buffer from an offset on, and a full mask."""
         observation_dim, action_dim = self._rows.observation_dim, self._rows.action_dim
         last = offset + self._width - 1
-        observations = ((*shape, observation_dim), (*strides, 1))
-        return Steps(
-            observations=memory.as_strided(*observations, offset),
-            actions=memory.as_strided((*shape, action_dim), (*strides, 1), offset + observation_dim),
-            rewards=memory.as_strided(shape, strides, last - 1),
-            next_observations=memory.as_strided(*observations, offset + self._width),
-            terminated=memory.as_strided(shape, strides, last),
-            mask=self._all_true(shape) if mask is None else mask,
-        )
+        vectors, rows = (*shape, observation_dim), (*strides, 1)
+        fields = [
+            (vectors, rows, offset),
+            ((*shape, action_dim), rows, offset + observation_dim),
+            (shape, strides, last - 1),
+            (vectors, rows, offset + self._width),
+            (shape, strides, last),
+        ]
+        if 0 in shape:  # nothing lies there, not even in the buffer
+            fields = [(size, stride, 0) for size, stride, _ in fields]
+        return fields, torch.ones(shape, dtype=torch.bool, device=self._device)
 
     def _trajectory_mask(self, draw: Draw, block: Tensor) -> Tensor:
         """(tasks, trajectories, longest episode); clears in the gathered block what follows an episode."""
-        shape = (*draw.trajectories.shape, self._longest)
-        if not self._is_ragged:
-            return self._all_true(shape)
+        shape = draw.trajectories.shape
         lengths = torch.from_numpy(self._rows.episodes.lengths[draw.trajectories]).to(block.device)[..., None]
         t = torch.arange(self._longest + 1, device=block.device)
-        rows = block.view(*shape[:2], self._longest + 1, self._width)
+        rows = block.view(*shape, self._longest + 1, self._width)
         rows.masked_fill_((t > lengths)[..., None], 0.0)
         return (t[:-1] < lengths).to(self._device)
-
-    def _all_true(self, shape: tuple[int, ...]) -> Tensor:
-        """A mask without padding; one for all batches."""
-        if shape not in self._masks:
-            self._masks[shape] = torch.ones(shape, dtype=torch.bool, device=self._device)
-        return self._masks[shape]
 
 
 def _overlapping(table: Tensor, floats: int) -> Tensor:
