@@ -75,7 +75,10 @@ class Gatherer:
 
     @staticmethod
     def _steps(memory: Tensor, fields: list[_Field], mask: Tensor) -> Steps:
-        return Steps(*[memory.as_strided(*field) for field in fields], mask=mask)
+        observations, actions, rewards, following, terminated = (
+            memory.as_strided(*field) for field in fields
+        )
+        return Steps(observations, actions, rewards, following, terminated, mask)
 
     def _layout(self, draw: Draw, ends: list[int]) -> list[tuple[list[_Field], Tensor]]:
         """Fields of transitions, windows, context and execution, with masks; the same for equal sizes."""
