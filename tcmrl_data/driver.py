@@ -63,7 +63,7 @@ class Driver:
         units = [self._unit(task) for task in sorted(missing, key=lambda task: task.index)]
         index_of = {_unit_id(task.index): task.index for task in missing}
         self._steps_total = self._source.training_steps * len(units)
-        make_groups(self._out, missing)
+        _make_groups(self._out, missing)
         failures: list[str] = []
         try:
             self.write_manifest()
@@ -199,7 +199,7 @@ def _failure(result: Result) -> str:
     return f"{result.id} failed after {result.attempt} attempt(s) on {result.node}: {result.error}"
 
 
-def make_groups(out: Path, tasks: Sequence[Task]) -> None:
+def _make_groups(out: Path, tasks: Sequence[Task]) -> None:
     """Makes the folders above the parts groups of one Zarr hierarchy."""
     folders = [out, out / "tasks"]
     for task in tasks:

@@ -2,7 +2,7 @@
 
 import contextlib
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -190,7 +190,35 @@ class _TaskRoller:
         trajectories = roll_out_part(spec, environment, self.task, snapshot, self._lanes)
         if self._references is None:
             self._references = self._measure_references()
-        return seal_part(spec, environment, self.task, snapshot, trajectories, self._references)
+        arrays = pack(trajectories)
+        digests = {
+            name: ArrayRecord.model_validate_json(canonical_json(each))
+            for name, each in array_digests(arrays).items()
+        }
+        identity = Identity(
+            schema_version=SCHEMA_VERSION,
+            data_version=DATA_VERSION,
+            settings=spec.recipe.unit_settings(),
+            task=self.task.index,
+            parameters=dict(self.task.parameters),
+            step=snapshot.step,
+            seed=spec.seed,
+            policy=snapshot.digest(),
+            arrays=digests,
+        )
+        files = encode_arrays(arrays) | snapshot.files()
+        record = PartRecord(
+            schema_version=SCHEMA_VERSION,
+            id=digest(identity.model_dump(mode="json")),
+            identity=identity,
+            statistics=statistics(trajectories),
+            references=self._references,
+            files={
+                name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())
+            },
+            provenance=provenance(environment),
+        )
+        return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}
 
     def _measure_references(self) -> References:
         """Uniform, oracle and noise-free scripted returns of the task, from one lane batch each."""
@@ -213,44 +241,6 @@ class _TaskRoller:
             oracle=mean_return(environment.oracle(self._parameters)),
             scripted=mean_return(environment.scripted(self._parameters, 0.0)),
         )
-
-
-def seal_part(
-    spec: UnitSpec,
-    environment: Environment,
-    task: Task,
-    snapshot: Snapshot,
-    trajectories: Sequence[Trajectory],
-    references: References,
-) -> tuple[str, dict[str, bytes]]:
-    """The id and all files of a part, `part.json` included."""
-    arrays = pack(trajectories)
-    digests = {
-        name: ArrayRecord.model_validate_json(canonical_json(each))
-        for name, each in array_digests(arrays).items()
-    }
-    identity = Identity(
-        schema_version=SCHEMA_VERSION,
-        data_version=DATA_VERSION,
-        settings=spec.recipe.unit_settings(),
-        task=task.index,
-        parameters=dict(task.parameters),
-        step=snapshot.step,
-        seed=spec.seed,
-        policy=snapshot.digest(),
-        arrays=digests,
-    )
-    files = encode_arrays(arrays) | snapshot.files()
-    record = PartRecord(
-        schema_version=SCHEMA_VERSION,
-        id=digest(identity.model_dump(mode="json")),
-        identity=identity,
-        statistics=statistics(trajectories),
-        references=references,
-        files={name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())},
-        provenance=provenance(environment),
-    )
-    return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}
 
 
 def part_bytes(recipe: Recipe) -> int:
