@@ -15,6 +15,7 @@ from tests.workers import MARK
 
 TASKS = [0, 3, 40, 60, 99]
 TINY = (
+    "behavior.source=sac",
     "behavior.sac.steps=150",
     "behavior.sac.warmup=50",
     "behavior.sac.snapshots=[0,100,150]",

@@ -201,8 +201,8 @@ def test_a_replay_makes_the_same_bits_and_notices_others(
     report = verify_dataset(forge.folder, replay=1)
     assert [each.problem for each in report.findings] == ["replay: actions differs in 1 of 120 rows"]
 
-    here = replay_module.provenance(open_dataset(forge.folder).environment)
-    monkeypatch.setattr(replay_module, "provenance", lambda environment: here | {"cpu": "another"})
+    here = replay_module.provenance(open_dataset(forge.folder).environment, {})
+    monkeypatch.setattr(replay_module, "provenance", lambda environment, behavior: here | {"cpu": "another"})
     report = verify_dataset(forge.folder, replay=1)
     assert [(each.exact, each.problems) for each in report.replays] == [(False, ())]
     reencoded(forge, "actions", lambda array: array.__setitem__(slice(None), np.clip(array + 0.1, -1, 1)))
