@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from .building import build, plan
+from .cache import cache
 from .frame import make_table, output_options, print_json, print_table, remark, run, size
 from .inspection import inspect
 from .progress import StageProgress
@@ -35,7 +36,7 @@ def data() -> None:
     """
 
 
-for _command in (plan, build, status, inspect, verify, repair, gc, import_policy):
+for _command in (plan, build, status, inspect, verify, repair, gc, import_policy, cache):
     data.add_command(_command)
 
 

@@ -44,16 +44,24 @@ class StageProgress:
         if self._bars is not None:
             self._bars.stop()
 
-    def update(self, stage: str, *, done: float, total: float, unit: str) -> None:
-        """Says how much of a stage is done, in its unit; stages appear with their first update."""
+    def update(self, stage: str, *, done: float, total: float, unit: str, detail: str = "") -> None:
+        """Says how much of a stage is done, in its unit; stages appear with their first update.
+
+        Args:
+            stage: its name.
+            done: how much is done.
+            total: how much there is to do.
+            unit: of both.
+            detail: what else there is to say, in a few words.
+        """
         if self._quiet or total <= 0:
             return
         if self._bars is None:
-            self._print_line(stage, done, total, unit)
+            self._print_line(stage, done, total, unit, detail)
             return
         if stage not in self._bar_of:
-            self._bar_of[stage] = self._bars.add_task(stage, total=total, unit=unit)
-        self._bars.update(self._bar_of[stage], completed=done, total=total)
+            self._bar_of[stage] = self._bars.add_task(stage, total=total, unit=unit, detail="")
+        self._bars.update(self._bar_of[stage], completed=done, total=total, detail=detail)
 
     def note(self, message: str) -> None:
         """Prints a line that stays, above the bars where there are bars."""
@@ -64,7 +72,7 @@ class StageProgress:
         else:
             click.echo(message, err=True)
 
-    def _print_line(self, stage: str, done: float, total: float, unit: str) -> None:
+    def _print_line(self, stage: str, done: float, total: float, unit: str, detail: str) -> None:
         now = time.monotonic()
         start, done_at_start = self._started.setdefault(stage, (now, done))
         ended, last = done >= total, self._printed.get(stage, start)
@@ -76,7 +84,9 @@ class StageProgress:
             self._ended.add(stage)
         rate = (done - done_at_start) / max(now - start, 1e-9)
         left = f", {duration((total - done) / rate)} left" if rate > 0 and not ended else ""
-        click.echo(f"{stage}: {done:,.0f} of {total:,.0f} {unit}, {rate:,.1f} {unit}/s{left}", err=True)
+        more = f", {detail}" if detail else ""
+        text = f"{stage}: {done:,.0f} of {total:,.0f} {unit}, {rate:,.1f} {unit}/s{more}{left}"
+        click.echo(text, err=True)
 
 
 def _bars() -> "Progress":
@@ -85,11 +95,12 @@ def _bars() -> "Progress":
     from rich.text import Text
 
     class AmountColumn(ProgressColumn):
-        """Done, total and rate in the stage's unit."""
+        """Done, total and rate in the stage's unit, and the stage's detail."""
 
         def render(self, task: Task) -> Text:
             rate = "" if not task.speed else f"  {task.speed:,.1f}/s"
-            return Text(f"{task.completed:,.0f}/{task.total or 0:,.0f} {task.fields['unit']}{rate}")
+            detail = f"  {task.fields['detail']}" if task.fields["detail"] else ""
+            return Text(f"{task.completed:,.0f}/{task.total or 0:,.0f} {task.fields['unit']}{rate}{detail}")
 
     return Progress(
         TextColumn("{task.description}"),

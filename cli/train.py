@@ -56,6 +56,11 @@ def tcmrl() -> None:
 )
 @click.option("--device", help="A torch device, such as cpu (default) or cuda.")
 @click.option(
+    "--memory-limit",
+    metavar="SIZE",
+    help="Read data that take more, such as 2G, through the cache; half of the available memory if left out.",
+)
+@click.option(
     "--set",
     "overrides",
     metavar="SECTION.KEY=VALUE",
@@ -76,6 +81,7 @@ def train(
     profile: Profile | None,
     steps: int | None,
     device: str | None,
+    memory_limit: str | None,
     overrides: tuple[str, ...],
     resume: bool,
     seed: int | None,
@@ -95,8 +101,9 @@ def train(
       tcmrl train data/half-cheetah-vel --set batch.window_length=8 --set tcmrl.latent=40
       tcmrl train data/point-robot --seed 1 --resume
     """
-    from tcmrl_data import open_dataset
+    from tcmrl_data import open_dataset, parse_bytes
 
+    limit = parse_bytes(memory_limit) if memory_limit else None
     if resume and (profile is not None or overrides):
         raise click.UsageError("--resume keeps the run's settings; leave out --profile and --set.")
     dataset = open_dataset(manifest)
@@ -104,7 +111,14 @@ def train(
         if resume:
             folder = out or _run_folder(dataset, algo or _default_algorithm(dataset), seed or 0)
             report = _resume(
-                folder, dataset, algo=algo, seed=seed, steps=steps, device=device, progress=progress
+                folder,
+                dataset,
+                algo=algo,
+                seed=seed,
+                steps=steps,
+                device=device,
+                memory_limit=limit,
+                progress=progress,
             )
         else:
             report = _train(
@@ -116,6 +130,7 @@ def train(
                 seed=seed or 0,
                 steps=steps,
                 device=device or "cpu",
+                memory_limit=limit,
                 progress=progress,
             )
     _print_training(report, as_json=as_json, quiet=quiet)
@@ -131,6 +146,7 @@ def _train(
     seed: int,
     steps: int | None,
     device: str,
+    memory_limit: int | None,
     progress: StageProgress,
 ) -> "TrainingReport":
     from tcmrl_algo import resolve, train_run
@@ -146,7 +162,9 @@ def _train(
         seed=seed,
         steps=steps,
         device=device,
+        memory_limit=memory_limit,
         report=lambda event: _show(progress, event),
+        say=progress.note,
     )
 
 
@@ -158,6 +176,7 @@ def _resume(
     seed: int | None,
     steps: int | None,
     device: str | None,
+    memory_limit: int | None,
     progress: StageProgress,
 ) -> "TrainingReport":
     from tcmrl_algo import open_run, resume_run
@@ -172,7 +191,13 @@ def _resume(
                 f"{folder} is a run with {name} {recorded}, not {asked}; leave {name} out."
             )
     return resume_run(
-        folder, dataset, steps=steps, device=device, report=lambda event: _show(progress, event)
+        folder,
+        dataset,
+        steps=steps,
+        device=device,
+        memory_limit=memory_limit,
+        report=lambda event: _show(progress, event),
+        say=progress.note,
     )
 
 
@@ -188,7 +213,8 @@ def _run_folder(dataset: "Dataset", algorithm: str, seed: int) -> Path:
 
 
 def _show(progress: StageProgress, event: "Progress") -> None:
-    progress.update("training", done=event.step, total=event.steps, unit="steps")
+    detail = f"{event.data_share:.0%} waiting for data"
+    progress.update("training", done=event.step, total=event.steps, unit="steps", detail=detail)
 
 
 def _print_training(report: "TrainingReport", *, as_json: bool, quiet: bool) -> None:

@@ -1,11 +1,13 @@
-"""Batches whose contexts come from other snapshots than the transitions that the actor-critic learns from."""
+"""The stream of batches that a run learns from; contexts may come from other snapshots than transitions."""
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol, final
 
 import torch
 
-from tcmrl_data import Batch, BatchSizes, Moments, Sampler, Selection
+from tcmrl_algo.config import ALGORITHMS, TrainingConfig
+from tcmrl_data import Batch, BatchSizes, Dataset, Moments, Sampler, plugin
 
 
 class Batches(Protocol):
@@ -19,32 +21,49 @@ class Batches(Protocol):
         """Statistics over all transitions that the actor-critic may see."""
         ...
 
+    @property
+    def short_trajectories(self) -> int:
+        """How many trajectories are shorter than K, and so hold no window."""
+        ...
+
+
+def open_batches(
+    dataset: Dataset,
+    config: TrainingConfig,
+    *,
+    seed: int,
+    device: torch.device,
+    memory_limit: int | None,
+    say: Callable[[str], None],
+) -> Batches:
+    """The stream of batches from the training tasks; arguments as of `train_run`."""
+    run = config.settings.run
+    sizes: BatchSizes = plugin(ALGORITHMS, "algorithm", run.algorithm).batch_sizes(config.settings)
+
+    def sampler(snapshots: str, sizes: BatchSizes) -> Sampler:
+        selection = dataset.select(split="train", snapshots=snapshots)
+        return selection.sampler(sizes, seed=seed, device=str(device), memory_limit=memory_limit, say=say)
+
+    if run.context_snapshots is None:
+        return sampler(run.snapshots, sizes)
+    nothing = {"context_trajectories": (0,), "execution_trajectories": 0, "windows": 0}
+    return JoinedBatches(
+        sampler(run.snapshots, sizes.model_copy(update=nothing)),
+        sampler(run.context_snapshots, sizes.model_copy(update={"transitions": 1})),
+    )
+
 
 @final
 class JoinedBatches:
-    """Transitions from one selection; context, execution trajectories and windows from another of its tasks.
+    """Transitions from one sampler; context, execution trajectories and windows from another.
 
     Args:
-        transitions: what the actor-critic learns from.
-        contexts: what the encoder learns from.
-        sizes: what a batch holds.
-        seed: of both samplers, which therefore draw the same tasks.
-        device: where batches are to be.
-
-    Raises:
-        SelectionError: a selection holds too little.
+        transitions: where the actor-critic's transitions come from.
+        contexts: where everything else comes from; of the same seed and tasks.
     """
 
-    def __init__(
-        self, transitions: Selection, contexts: Selection, sizes: BatchSizes, *, seed: int, device: str
-    ) -> None:
-        nothing = {"context_trajectories": (0,), "execution_trajectories": 0, "windows": 0}
-        self._transitions: Sampler = transitions.sampler(
-            sizes.model_copy(update=nothing), seed=seed, device=device
-        )
-        self._contexts: Sampler = contexts.sampler(
-            sizes.model_copy(update={"transitions": 1}), seed=seed, device=device
-        )
+    def __init__(self, transitions: Sampler, contexts: Sampler) -> None:
+        self._transitions, self._contexts = transitions, contexts
 
     def batch(self, n: int) -> Batch:
         """The n-th batch, n >= 0."""
@@ -56,3 +75,8 @@ class JoinedBatches:
     def moments(self) -> Moments:
         """Statistics over the actor-critic's transitions."""
         return self._transitions.moments()
+
+    @property
+    def short_trajectories(self) -> int:
+        """How many of the contexts' trajectories are shorter than K."""
+        return self._contexts.short_trajectories

@@ -12,12 +12,12 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from tcmrl_algo.batches import Batches, JoinedBatches
+from tcmrl_algo.batches import Batches, open_batches
 from tcmrl_algo.checkpoint import Run, RunRecord, open_run, write_run
 from tcmrl_algo.config import ALGORITHMS, TrainingConfig, validated
 from tcmrl_algo.metrics import MetricsWriter
 from tcmrl_algo.problem import Algorithm, MomentsRecord, problem_of
-from tcmrl_data import BatchSizes, CheckpointError, Dataset, TrainingError, plugin
+from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError, plugin
 
 PACKAGES = ("torch", "numpy")
 """Whose versions results depend on."""
@@ -26,6 +26,9 @@ REMEDY = (
     "optimizer.gradient_norm with --set"
 )
 """Against divergence."""
+
+PREFETCHED = 2
+"""Batches that wait ready; results do not depend on it."""
 
 
 @dataclass(frozen=True)
@@ -36,12 +39,14 @@ class Progress:
         step: steps done.
         steps: steps to do.
         rate: steps per second since the last report.
+        data_share: share of that time spent waiting for batches.
         metrics: of that step.
     """
 
     step: int
     steps: int
     rate: float
+    data_share: float
     metrics: Mapping[str, float]
 
 
@@ -66,6 +71,10 @@ def ignore(progress: Progress) -> None:
     """Reports nothing."""
 
 
+def keep_quiet(message: str) -> None:
+    """Says nothing."""
+
+
 def train_run(
     dataset: Dataset,
     out: str | Path,
@@ -75,7 +84,9 @@ def train_run(
     seed: int = 0,
     steps: int | None = None,
     device: str = "cpu",
+    memory_limit: int | None = None,
     report: Callable[[Progress], None] = ignore,
+    say: Callable[[str], None] = keep_quiet,
 ) -> TrainingReport:
     """Trains a new run.
 
@@ -87,7 +98,9 @@ def train_run(
         seed: of everything random.
         steps: where to stop, instead of `run.steps`; schedules keep the length that `run.steps` gives them.
         device: a torch device.
+        memory_limit: bytes of data beyond which the cache is used; half of the available memory if None.
         report: called after every logged step.
+        say: told where data are read from, where that is not memory.
 
     Raises:
         CheckpointError: the folder holds a run already.
@@ -101,7 +114,9 @@ def train_run(
     """
     if (Path(out) / "run.json").exists():
         raise CheckpointError(f"{out} holds a run already; go on with --resume, or name another --out")
-    batches = _batches(dataset, config, seed=seed, device=device)
+    batches = open_batches(
+        dataset, config, seed=seed, device=_device(device), memory_limit=memory_limit, say=say
+    )
     record = RunRecord(
         environment=dataset.name,
         dataset=str(dataset.folder.resolve()),
@@ -125,7 +140,9 @@ def resume_run(
     *,
     steps: int | None = None,
     device: str | None = None,
+    memory_limit: int | None = None,
     report: Callable[[Progress], None] = ignore,
+    say: Callable[[str], None] = keep_quiet,
 ) -> TrainingReport:
     """Goes on from a run's newest checkpoint; ends as an uninterrupted run of the same length would have.
 
@@ -134,7 +151,9 @@ def resume_run(
         dataset: the one it was trained on.
         steps: another place to stop.
         device: another device.
+        memory_limit: as for `train_run`.
         report: called after every logged step.
+        say: as for `train_run`.
 
     Raises:
         CheckpointError: no run, another dataset, or already further than `steps`.
@@ -147,7 +166,14 @@ def resume_run(
     start = run.checkpoints()[-1].step if run.checkpoints() else 0
     if start > record.steps:
         raise CheckpointError(f"{out} is at step {start} already, beyond --steps {record.steps}")
-    batches = _batches(dataset, record.config, seed=record.seed, device=record.device)
+    batches = open_batches(
+        dataset,
+        record.config,
+        seed=record.seed,
+        device=_device(record.device),
+        memory_limit=memory_limit,
+        say=say,
+    )
     algorithm = create_algorithm(record, dataset)
     if start:
         algorithm.load_tensors(run.newest().tensors())
@@ -185,20 +211,6 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
     return total.hexdigest()
 
 
-def _batches(dataset: Dataset, config: TrainingConfig, *, seed: int, device: str) -> Batches:
-    """The stream of batches from the training tasks."""
-    settings = config.settings
-    module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
-    sizes: BatchSizes = module.batch_sizes(settings)
-
-    place = str(_device(device))
-    transitions = dataset.select(split="train", snapshots=settings.run.snapshots)
-    if settings.run.context_snapshots is None:
-        return transitions.sampler(sizes, seed=seed, device=place)
-    contexts = dataset.select(split="train", snapshots=settings.run.context_snapshots)
-    return JoinedBatches(transitions, contexts, sizes, seed=seed, device=place)
-
-
 def _train(
     run: Run,
     algorithm: Algorithm,
@@ -210,18 +222,24 @@ def _train(
     """The loop: batch n - 1 makes step n."""
     settings, last = run.record.config.settings.run, run.record.steps
     began = time.perf_counter()
-    logged_at, logged_step = began, start
-    with MetricsWriter(run.folder, step=start) as writer:
+    logged_at, logged_step, logged_wait = began, start, 0.0
+    with (
+        MetricsWriter(run.folder, step=start) as writer,
+        Prefetch(batches.batch, range(start, last), depth=PREFETCHED) as stream,
+    ):
         for step in range(start + 1, last + 1):
-            metrics = algorithm.update(batches.batch(step - 1), step)
+            metrics = algorithm.update(next(stream), step)
             _check_sizes(metrics, algorithm.limits(), step)
             if step % settings.log_every == 0 or step == last:
                 values = {name: float(each) for name, each in metrics.items()}
                 now = time.perf_counter()
-                rate = (step - logged_step) / max(now - logged_at, 1e-9)
-                logged_at, logged_step = now, step
-                writer.write(step, values | {"time/steps_per_second": rate})
-                report(Progress(step, last, rate, values))
+                seconds = max(now - logged_at, 1e-9)
+                rate, share = (step - logged_step) / seconds, (stream.waited - logged_wait) / seconds
+                logged_at, logged_step, logged_wait = now, step, stream.waited
+                about = {"data/short_trajectories": float(batches.short_trajectories)}
+                times = {"time/steps_per_second": rate, "time/data_share": share}
+                writer.write(step, values | about | times)
+                report(Progress(step, last, rate, share, values))
             if step % settings.checkpoint_every == 0 or step == last:
                 _check_finite(algorithm.tensors(), step)
                 run.save(step, algorithm.tensors())

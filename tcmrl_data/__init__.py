@@ -8,7 +8,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tcmrl_data.batch import Batch, BatchSizes, Moments, Steps
     from tcmrl_data.build import BuildReport, build_dataset
+    from tcmrl_data.cache import CacheEntry, cache_folder, cache_limit, clear_cache, list_cache, parse_bytes
     from tcmrl_data.canonical import canonical_json, parse_json
     from tcmrl_data.dataset import Dataset, Selection, open_dataset
     from tcmrl_data.discovery import plugin
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
     from tcmrl_data.listing import list_datasets
     from tcmrl_data.manifest import Manifest
     from tcmrl_data.plan import Plan, plan_build
+    from tcmrl_data.prefetch import Prefetch
     from tcmrl_data.recipe import (
         PROFILES,
         Recipe,
@@ -38,7 +41,7 @@ if TYPE_CHECKING:
     from tcmrl_data.replay import Replay
     from tcmrl_data.returns import return_table
     from tcmrl_data.rollout import roll_out
-    from tcmrl_data.sampler import Batch, BatchSizes, Moments, Sampler, Steps
+    from tcmrl_data.sampler import Sampler
     from tcmrl_data.seeding import NO_TASK, Purpose, keyed_generator, keyed_seed
     from tcmrl_data.snapshot import import_sac
     from tcmrl_data.tasks import Task, draw_tasks, parse_indices
@@ -46,7 +49,9 @@ if TYPE_CHECKING:
     from tcmrl_data.verify import Finding, VerifyLevel, VerifyReport, verify_dataset
 
 _HOMES = {
+    "batch": ("Batch", "BatchSizes", "Moments", "Steps"),
     "build": ("BuildReport", "build_dataset"),
+    "cache": ("CacheEntry", "cache_folder", "cache_limit", "clear_cache", "list_cache", "parse_bytes"),
     "canonical": ("canonical_json", "parse_json"),
     "dataset": ("Dataset", "Selection", "open_dataset"),
     "discovery": ("plugin",),
@@ -64,12 +69,13 @@ _HOMES = {
     "listing": ("list_datasets",),
     "manifest": ("Manifest",),
     "plan": ("Plan", "plan_build"),
+    "prefetch": ("Prefetch",),
     "recipe": ("PROFILES", "Recipe", "apply_overrides", "first_problem", "list_environments", "load_recipe"),
     "repair": ("RepairReport", "repair_dataset"),
     "replay": ("Replay",),
     "returns": ("return_table",),
     "rollout": ("roll_out",),
-    "sampler": ("Batch", "BatchSizes", "Moments", "Sampler", "Steps"),
+    "sampler": ("Sampler",),
     "seeding": ("NO_TASK", "Purpose", "keyed_generator", "keyed_seed"),
     "snapshot": ("import_sac",),
     "tasks": ("Task", "draw_tasks", "parse_indices"),
@@ -86,6 +92,7 @@ __all__ = [
     "BuildEvent",
     "BuildReport",
     "BuildStatus",
+    "CacheEntry",
     "CheckpointError",
     "Controller",
     "Dataset",
@@ -96,6 +103,7 @@ __all__ = [
     "Manifest",
     "Moments",
     "Plan",
+    "Prefetch",
     "Purpose",
     "Recipe",
     "RepairReport",
@@ -114,7 +122,10 @@ __all__ = [
     "apply_overrides",
     "build_dataset",
     "build_status",
+    "cache_folder",
+    "cache_limit",
     "canonical_json",
+    "clear_cache",
     "collect_garbage",
     "draw_tasks",
     "environment_types",
@@ -122,11 +133,13 @@ __all__ = [
     "import_sac",
     "keyed_generator",
     "keyed_seed",
+    "list_cache",
     "list_datasets",
     "list_environments",
     "load_recipe",
     "make_environment",
     "open_dataset",
+    "parse_bytes",
     "parse_indices",
     "parse_json",
     "plan_build",

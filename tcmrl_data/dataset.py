@@ -2,7 +2,7 @@
 
 import functools
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -277,12 +277,31 @@ class Selection:
         """All selected episodes of a task, snapshot by snapshot."""
         return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
 
-    def sampler(self, sizes: "BatchSizes", *, seed: int, device: str = "cpu") -> "Sampler":
+    def sampler(
+        self,
+        sizes: "BatchSizes",
+        *,
+        seed: int,
+        stream: int = 0,
+        device: str = "cpu",
+        memory_limit: int | None = None,
+        say: Callable[[str], None] = lambda message: None,
+    ) -> "Sampler":
         """Loads the selection once and serves meta-training batches from it.
+
+        Args:
+            sizes: what a batch holds.
+            seed: of the run; batch n is a function of (seed, stream, n).
+            stream: further streams of batches under the same seed.
+            device: where batches are to be.
+            memory_limit: bytes that the decoded steps may take in memory, half of what is available if left
+                out; larger selections are decoded into the cache once and read from there.
+            say: told when the cache is used.
 
         Raises:
             SelectionError: the selection holds test tasks, fewer than two tasks, or too little of one.
         """
+        from tcmrl_data.cache import load_rows
         from tcmrl_data.sampler import Sampler
 
         test = [task.index for task in self.tasks if task.split == "test"]
@@ -292,4 +311,12 @@ class Selection:
             raise SelectionError(
                 f"meta-training needs at least 2 training tasks, the selection has {len(self.tasks)}"
             )
-        return Sampler(self, sizes, seed=seed, device=device)
+        return Sampler(
+            load_rows(self, memory_limit=memory_limit, say=say),
+            sizes,
+            seed=seed,
+            stream=stream,
+            environment=self.dataset.name,
+            place=str(self.dataset.folder),
+            device=device,
+        )

@@ -45,6 +45,10 @@ class StorageError(BuildError):
     """The disk refused an operation; what was published before stands."""
 
 
+class CacheError(TcmrlError):
+    """The cache of decoded steps cannot be used, or a size of it that cannot be read."""
+
+
 class LockedError(BuildError):
     """Another process works on the dataset."""
 

@@ -4,6 +4,7 @@ Nothing is decoded that the size on disk does not justify: arrays may decode to 
 their files where that is more (real parts: at most about 12 times, since sampled actions do not compress).
 """
 
+import functools
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
@@ -226,8 +227,8 @@ Metadata = TypeVar("Metadata", bound=_Metadata)
 
 def _read_metadata(kind: type[Metadata], file: Path) -> Metadata:
     try:
-        values = parse_json(read_plain_file(file, limit=METADATA_BYTES))
-        return kind.model_validate_json(canonical_json(values))
+        metadata: Metadata = _parse_metadata(kind, read_plain_file(file, limit=METADATA_BYTES))
+        return metadata
     except ValidationError as error:
         detail = error.errors()[0]
         field = ".".join(map(str, detail["loc"])) or "values"
@@ -236,3 +237,8 @@ def _read_metadata(kind: type[Metadata], file: Path) -> Metadata:
         raise StoreError(f"{file} is missing; run `tcmrl-data repair`") from None
     except (OSError, ValueError) as error:
         raise StoreError(f"{file}: not readable as zarr.json ({one_line(error)})") from None
+
+
+@functools.lru_cache(maxsize=512)  # parts of equally long episodes have the same files, byte for byte
+def _parse_metadata(kind: type[Metadata], data: bytes) -> Metadata:
+    return kind.model_validate_json(canonical_json(parse_json(data)))

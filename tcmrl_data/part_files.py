@@ -1,5 +1,6 @@
 """Which files a part consists of, and whether they lie there as recorded; contents are not read."""
 
+import os
 from collections.abc import Iterator, Sequence
 from math import prod
 from pathlib import Path
@@ -40,12 +41,11 @@ def unrecorded_file(record: PartRecord, layouts: Sequence[ArrayLayout]) -> str |
 
 def file_mismatch(folder: Path, name: str, expected: FileRecord) -> str | None:
     """Why a recorded file is not what it must be, its content aside; None where all is well."""
-    parent = Path(name).parent.as_posix()
-    blocked = folder_problem(folder, parent)
+    blocked = folder_problem(folder, os.path.dirname(name))
     if blocked:
         return f"cannot be reached: {blocked[0]} {blocked[1]}"
     try:
-        status = (folder / name).lstat()
+        status = os.lstat(os.path.join(folder, name))
     except FileNotFoundError:
         return "is missing"
     except OSError as error:

@@ -50,7 +50,7 @@ def write_file(path: Path, data: bytes) -> None:
     Raises:
         StorageError: the disk refuses.
     """
-    with _named_errors(path):
+    with named_errors(path):
         disk.write(path, data)
         disk.sync(path)
 
@@ -58,7 +58,7 @@ def write_file(path: Path, data: bytes) -> None:
 def make_folders(path: Path) -> None:
     """Makes a folder and its parents, each name forced to disk."""
     missing = [each for each in (path, *path.parents) if not each.exists()]
-    with _named_errors(path):
+    with named_errors(path):
         for each in reversed(missing):
             with contextlib.suppress(FileExistsError):  # another worker may have made it meanwhile
                 disk.make_folder(each)
@@ -68,7 +68,7 @@ def make_folders(path: Path) -> None:
 def _make_staging(path: Path) -> None:
     """Makes the staging folder; its name may be lost, since nothing in it is meant to last."""
     if not path.is_dir():
-        with _named_errors(path), contextlib.suppress(FileExistsError):
+        with named_errors(path), contextlib.suppress(FileExistsError):
             disk.make_folder(path)
 
 
@@ -79,7 +79,7 @@ def write_tree(folder: Path, files: Mapping[str, bytes]) -> None:
         StorageError: the disk refuses.
     """
     folders = {folder, *(folder / each for name in files for each in Path(name).parents)}
-    with _named_errors(folder):
+    with named_errors(folder):
         for each in sorted(folders):
             disk.make_folder(each)
         for name, data in files.items():
@@ -103,7 +103,7 @@ def replace_file(path: Path, data: bytes, *, staging: Path) -> None:
     _make_staging(staging)
     make_folders(path.parent)
     temporary = staging / f"{path.name}.{uuid.uuid4().hex}"
-    with _named_errors(path):
+    with named_errors(path):
         try:
             write_file(temporary, data)
             disk.rename(temporary, path)
@@ -150,7 +150,7 @@ def move_into_place(staged: Path, target: Path) -> bool:
     Raises:
         StorageError: the disk refuses.
     """
-    with _named_errors(target):
+    with named_errors(target):
         try:
             disk.rename(staged, target)
         except OSError as error:
@@ -162,7 +162,7 @@ def move_into_place(staged: Path, target: Path) -> bool:
 
 
 @contextlib.contextmanager
-def _named_errors(path: Path) -> Iterator[None]:
+def named_errors(path: Path) -> Iterator[None]:
     """Turns what the operating system reports into an error with a remedy."""
     try:
         yield

@@ -36,14 +36,16 @@ def validated(kind: type[Kind], values: Any, file: Path, *, version: int) -> Kin
         raise ManifestError(
             f"{file}: schema_version {repr(found)[:40]} is not {version}, which this version reads"
         )
-    hidden = _hidden_text(values)
+    text = canonical_json(values)
+    # canonical JSON escapes whatever is not printable ASCII, but for DEL
+    hidden = _hidden_text(values) if b"\\" in text or b"\x7f" in text else None
     if hidden:
         place = printable(hidden)[:200]
         raise ManifestError(f"{file}: {place} holds control characters, which a terminal would obey")
     try:
         # errors over JSON text copy what they complain of, over and over; these refer to it
         kind.model_validate(_with_tuples(values))
-        return kind.model_validate_json(canonical_json(values))
+        return kind.model_validate_json(text)
     except ValidationError as error:
         raise ManifestError(f"{file}: {printable(first_problem(error))[:500]}") from None
 

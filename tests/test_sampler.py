@@ -1,5 +1,4 @@
 import dataclasses
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,8 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tcmrl_data import Batch, BatchSizes, Dataset, Steps, Trajectory
+from tcmrl_data.draws import BLOCK, distinct
 from tcmrl_data.errors import SelectionError
-from tcmrl_data.sampler import Sampler, distinct
+from tcmrl_data.sampler import Sampler
+from tests.sampling import numbered_tasks, sampler_of
 from tests.strategies import trajectories
 
 SIZES = BatchSizes(
@@ -22,41 +23,15 @@ SIZES = BatchSizes(
 )
 
 
-class InMemorySelection:
-    """Offers a sampler what a selection offers, over trajectories made in the test."""
-
-    def __init__(self, episodes: list[list[Trajectory]]) -> None:
-        self._episodes = episodes
-        self.dataset = self
-        self.folder = Path("memory")
-        self.environment = self
-        self.name = "memory"
-        self.observation_dim = episodes[0][0].observations.shape[1]
-        self.action_dim = episodes[0][0].actions.shape[1]
-        self.tasks = tuple(type("Task", (), {"index": i})() for i in range(len(episodes)))
-
-    def trajectories(self, task: int) -> list[Trajectory]:
-        return self._episodes[task]
-
-
-def numbered(task: int, episode: int, steps: int) -> Trajectory:
-    """Observations that say where they come from: (task, episode, t)."""
-    observations = np.array([[task, episode, t] for t in range(steps + 1)], dtype=np.float32)
-    truncated = np.arange(1, steps + 1) == steps
-    terminated = truncated & (episode % 2 == 0)
-    rewards = observations[:-1] @ np.array([100.0, 10.0, 1.0])
-    return Trajectory(observations, np.zeros((steps, 1)), rewards, terminated, truncated & ~terminated)
-
-
 LENGTHS = [[5, 9, 4, 7], [3, 8, 8, 6], [10, 4, 5, 1]]
+
+
+EQUAL = [[6, 6, 6, 6]] * 3
 
 
 @pytest.fixture
 def sampler() -> Sampler:
-    episodes = [
-        [numbered(b, e, steps) for e, steps in enumerate(lengths)] for b, lengths in enumerate(LENGTHS)
-    ]
-    return Sampler(InMemorySelection(episodes), SIZES, seed=3)  # type: ignore[arg-type]
+    return sampler_of(numbered_tasks(LENGTHS), SIZES, seed=3)
 
 
 def leaves(batch: Batch) -> list[torch.Tensor]:
@@ -87,8 +62,8 @@ def test_rows_of_a_batch_belong_to_its_tasks(sampler: Sampler) -> None:
     batch = sampler.batch(0)
     assert sorted(batch.task_indices.tolist()) == [0, 1, 2]
     for steps in (batch.transitions, batch.context, batch.execution, batch.windows):
-        tasks = steps.observations[..., 0].flatten(1)
-        assert torch.equal(tasks, batch.task_indices[:, None].expand_as(tasks).float())
+        tasks, mask = steps.observations[..., 0].flatten(1), steps.mask.flatten(1)
+        assert torch.equal(tasks[mask], batch.task_indices[:, None].expand_as(tasks)[mask].float())
 
 
 def test_windows_never_cross_an_episode(sampler: Sampler) -> None:
@@ -119,48 +94,148 @@ def test_masks_mark_the_episode_and_nothing_else(sampler: Sampler) -> None:
     assert torch.equal(t[context.mask], torch.arange(10).expand_as(t)[context.mask].float())
 
 
-@pytest.mark.parametrize("kind", ["transitions", "windows"])
-def test_draws_are_uniform_over_valid_rows(sampler: Sampler, kind: str) -> None:
-    counts: dict[tuple[float, ...], int] = {}
-    for n in range(400):
-        rows = getattr(sampler.batch(n), kind).observations.reshape(
-            3, -1, *([4] if kind == "windows" else []), 3
-        )
-        first = rows[:, :, 0] if kind == "windows" else rows
-        for key in map(tuple, first[first[..., 0] == 0].tolist()):
-            counts[key] = counts.get(key, 0) + 1
-    valid = sum(max(0, steps - (3 if kind == "windows" else 0)) for steps in LENGTHS[0])
-    assert len(counts) == valid
-    expected = sum(counts.values()) / valid
-    chi_square = sum((count - expected) ** 2 / expected for count in counts.values())
-    assert chi_square < valid + 4 * np.sqrt(2 * valid)  # mean df, four standard deviations
+def chi_square(counts: np.typing.NDArray[np.int64]) -> float:
+    """Standard deviations by which the statistic of equal shares lies above its mean."""
+    expected = counts.sum() / counts.size
+    freedom = counts.size - 1
+    return float((np.square(counts - expected).sum() / expected - freedom) / np.sqrt(2 * freedom))
+
+
+@pytest.mark.parametrize("lengths", [LENGTHS, EQUAL], ids=["ragged", "equal"])
+def test_a_million_draws_are_uniform(lengths: list[list[int]]) -> None:
+    """Tasks over tasks; transitions, windows and trajectories over all valid ones of a task."""
+    sizes = BatchSizes(tasks=2, transitions=1000, execution_trajectories=1, windows=1000, window_length=4)
+    sampler = sampler_of(numbered_tasks(lengths), sizes)
+    rows = np.zeros((2, len(sampler._rows.table)), dtype=np.int64)
+    tasks, episodes = np.zeros(3, dtype=np.int64), np.zeros(12, dtype=np.int64)
+    for n in range(500):
+        draw = sampler._draws(n)
+        for counts, drawn in zip(rows, (draw.transitions, draw.windows), strict=True):
+            counts += np.bincount(drawn.ravel(), minlength=len(counts))
+        tasks += np.bincount(draw.tasks, minlength=3)
+        episodes += np.bincount(draw.trajectories.ravel(), minlength=12)
+    assert rows.sum() == 2 * 10**6
+    assert chi_square(tasks) < 4
+    first = 0
+    for task, each in enumerate(lengths):
+        stop = first + sum(steps + 1 for steps in each)
+        for counts, steps in zip(rows[:, first:stop], (1, 4), strict=True):
+            valid = counts[counts > 0]
+            assert len(valid) == sum(max(0, length - steps + 1) for length in each)
+            assert chi_square(valid) < 4
+        assert chi_square(episodes[4 * task : 4 * task + 4]) < 4
+        first = stop
+
+
+@given(
+    st.lists(st.lists(st.sampled_from([0, 1, 3, 4, 5]), min_size=3, max_size=5), min_size=2, max_size=3),
+    st.integers(0, 40),
+)
+@settings(deadline=None, max_examples=60)
+def test_every_length_around_k_is_served_as_stated(lengths: list[list[int]], n: int) -> None:
+    """K = 4: episodes of 0, 1, K - 1, K and K + 1 steps."""
+    for each in lengths:
+        each += [1, 5]
+    sizes = BatchSizes(tasks=3, transitions=9, execution_trajectories=1, windows=7, window_length=4)
+    sampler = sampler_of(numbered_tasks(lengths), sizes)
+    assert sampler.short_trajectories == sum(0 < steps < 4 for each in lengths for steps in each)
+    batch = sampler.batch(n)
+    for steps in (batch.transitions, batch.context, batch.execution, batch.windows):
+        task, episode, t = (each[steps.mask] for each in steps.observations.unbind(-1))
+        length = torch.tensor([lengths[int(b)][int(e)] for b, e in zip(task, episode, strict=True)])
+        assert (t < length).all() and steps.mask.flatten(1).any(1).all()
+        following = torch.stack([task, episode, t + 1], -1)
+        assert torch.equal(steps.next_observations[steps.mask], following)
+        assert torch.equal(steps.rewards[steps.mask], 100 * task + 10 * episode + t)
+        assert torch.equal(steps.terminated[steps.mask].bool(), (t == length - 1) & (episode % 2 == 0))
+        assert not steps.rewards[~steps.mask].any() and not steps.actions[~steps.mask].any()
+    assert batch.context.mask.sum(-1).min() > 0, "an episode without steps was drawn"
+
+
+def test_padding_holds_nothing_of_another_episode(sampler: Sampler) -> None:
+    context = sampler.batch(0).context
+    beyond = ~context.mask
+    assert not context.next_observations[beyond].any()
+    first_padding = beyond & torch.cat([torch.ones_like(beyond[..., :1]), context.mask[..., :-1]], -1)
+    assert not context.observations[beyond & ~first_padding].any()
+
+
+def test_kept_batches_are_never_overwritten_and_dropped_ones_are_used_again(sampler: Sampler) -> None:
+    kept = [sampler.batch(n) for n in range(40)]
+    view = sampler.batch(40).windows.rewards[1]  # a part of a batch counts as much
+    before = [[leaf.clone() for leaf in leaves(batch)] for batch in kept], view.clone()
+    for n in range(41, 141):
+        sampler.batch(n)
+    assert all(
+        torch.equal(a, b)
+        for batch, copies in zip(kept, before[0], strict=True)
+        for a, b in zip(leaves(batch), copies, strict=True)
+    )
+    assert torch.equal(view, before[1])
+    del kept, view
+    places = {sampler.batch(n).transitions.observations.data_ptr() for n in range(100)}
+    assert len(places) <= 2
+
+
+def test_tasks_depend_on_seed_and_number_alone(sampler: Sampler) -> None:
+    """Two samplers of one seed over the same tasks may be read side by side."""
+    fewer = SIZES.model_copy(
+        update={"transitions": 1, "context_trajectories": (0,), "execution_trajectories": 0, "windows": 0}
+    )
+    other = sampler_of(numbered_tasks([[9, 2]] * 3), fewer, seed=3)
+    for n in (0, 1, 17, 40):
+        batch = other.batch(n)
+        assert torch.equal(batch.task_indices, sampler.batch(n).task_indices)
+        assert batch.context.observations.shape == batch.execution.observations.shape == (3, 0, 9, 3)
+
+
+def test_streams_of_one_seed_differ(sampler: Sampler) -> None:
+    first, second = (sampler_of(numbered_tasks(LENGTHS), SIZES, seed=3, stream=stream) for stream in (0, 1))
+    assert torch.equal(first.batch(5).windows.rewards, sampler.batch(5).windows.rewards)
+    assert not torch.equal(first.batch(5).windows.rewards, second.batch(5).windows.rewards)
+
+
+@given(st.integers(0, 10 * BLOCK))
+@settings(deadline=None, max_examples=30)
+def test_resuming_at_n_gives_the_batches_of_an_uninterrupted_run(n: int) -> None:
+    straight, resumed = (sampler_of(numbered_tasks(LENGTHS), SIZES) for _ in range(2))
+    for earlier in range(max(0, n - 3), n):
+        straight.batch(earlier)
+    for each in range(n, n + 2):
+        pairs = zip(leaves(straight.batch(each)), leaves(resumed.batch(each)), strict=True)
+        assert all(torch.equal(a, b) for a, b in pairs)
 
 
 @given(st.integers(1, 6), st.integers(6, 9), st.integers(0, 1000))
 def test_distinct_draws_are_distinct_and_in_range(count: int, size: int, seed: int) -> None:
     ranges = np.array([[10, 10 + size], [50, 50 + size]])
-    picks = distinct(np.random.default_rng(seed), ranges, count)
+    picks = distinct(ranges, np.random.default_rng(seed).random((2, count)))
     assert all(len(set(row)) == count for row in picks.tolist())
     assert ((picks >= ranges[:, :1]) & (picks < ranges[:, 1:])).all()
 
 
 def test_distinct_draws_are_uniform() -> None:
-    picks = distinct(np.random.default_rng(0), np.tile([0, 5], (20_000, 1)), 3)
+    picks = distinct(np.tile([0, 5], (20_000, 1)), np.random.default_rng(0).random((20_000, 3)))
     for column in picks.T:
         assert np.abs(np.bincount(column, minlength=5) / 20_000 - 0.2).max() < 0.015
 
 
-@given(st.lists(st.lists(trajectories(min_steps=1), min_size=2, max_size=4), min_size=2, max_size=3))
+@given(
+    st.integers(1, 20),
+    st.lists(st.lists(trajectories(min_steps=1), min_size=2, max_size=4), min_size=2, max_size=3),
+)
 @settings(deadline=None, max_examples=30)
-def test_moments_equal_those_of_the_flat_data(episodes: list[list[Trajectory]]) -> None:
+def test_moments_equal_those_of_the_flat_data(chunk_rows: int, episodes: list[list[Trajectory]]) -> None:
     sizes = BatchSizes(transitions=4, window_length=2)
-    moments = Sampler(InMemorySelection(episodes), sizes, seed=0).moments()  # type: ignore[arg-type]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("tcmrl_data.moments.CHUNK_ROWS", chunk_rows)
+        found = sampler_of(episodes, sizes).moments()
     flat = [each for task in episodes for each in task]
     observations = np.concatenate([each.observations[:-1] for each in flat]).astype(np.float64)
     deltas = np.concatenate([np.diff(each.observations, axis=0) for each in flat]).astype(np.float64)
-    np.testing.assert_allclose(moments.observation_mean, observations.mean(0), atol=1e-6)
-    np.testing.assert_allclose(moments.delta_std, np.maximum(deltas.std(0), 1e-6), atol=1e-5)
-    assert moments.longest_episode == max(len(each) for each in flat)
+    np.testing.assert_allclose(found.observation_mean, observations.mean(0), atol=1e-6)
+    np.testing.assert_allclose(found.delta_std, np.maximum(deltas.std(0), 1e-6), atol=1e-5)
+    assert found.longest_episode == max(len(each) for each in flat)
 
 
 def test_test_tasks_are_refused_for_training(tiny: Dataset) -> None:
@@ -187,10 +262,7 @@ def test_no_task_parameter_is_reachable_from_a_batch(sampler: Sampler) -> None:
     assert {field.name for field in dataclasses.fields(Steps)} == {
         "observations", "actions", "rewards", "next_observations", "terminated", "mask",
     }  # fmt: skip
-    batch = sampler.batch(0)
-    assert all(isinstance(leaf, torch.Tensor) for leaf in leaves(batch))
-    reachable = [value for value in vars(sampler).values() if isinstance(value, tuple | list | dict)]
-    assert not any(hasattr(each, "parameters") for value in reachable for each in value)
+    assert all(isinstance(leaf, torch.Tensor) for leaf in leaves(sampler.batch(0)))
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")

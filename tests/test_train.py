@@ -169,6 +169,9 @@ def test_metrics_are_logged_as_lines_and_to_tensorboard(start: Train) -> None:
         lines[0]
     )
     assert list((folder / "tensorboard").glob("events*"))
+    raw = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
+    assert all(0 <= line["time/data_share"] <= 1 for line in raw)
+    assert {line["data/short_trajectories"] for line in raw} == {0.0}
 
 
 def test_only_the_newest_checkpoints_stay(start: Train, tiny: Dataset) -> None:
@@ -282,7 +285,8 @@ def test_joined_batches_take_each_kind_from_its_selection(tiny: Dataset) -> None
     stored = [each for task in last.tasks for each in last.trajectories(task.index)]
     own = {float(reward) for each in stored for reward in each.rewards}
     sizes = BatchSizes(tasks=3, transitions=9, context_trajectories=(1, 2), windows=2)
-    joined = JoinedBatches(last, whole, sizes, seed=0, device="cpu")
+    none = sizes.model_copy(update={"context_trajectories": (0,), "execution_trajectories": 0, "windows": 0})
+    joined = JoinedBatches(last.sampler(none, seed=0), whole.sampler(sizes, seed=0))
     batches = [joined.batch(n) for n in range(10)]
     assert all(each.transitions.rewards.shape == (3, 9) for each in batches)
     assert all(set(each.transitions.rewards.flatten().tolist()) <= own for each in batches)
@@ -296,7 +300,29 @@ def test_progress_is_reported_with_rates(start: Train) -> None:
     seen: list[Progress] = []
     start("run", steps=25, report=seen.append)
     assert [(each.step, each.steps) for each in seen] == [(10, 25), (20, 25), (25, 25)]
-    assert all(each.rate > 0 for each in seen)
+    assert all(each.rate > 0 and 0 <= each.data_share <= 1 for each in seen)
+
+
+def test_the_memory_limit_changes_where_data_are_and_no_result(
+    start: Train, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TCMRL_CACHE", str(tmp_path / "cache"))
+    said: list[str] = []
+    straight = start("memory", steps=20, say=said.append)
+    assert said == []
+    half = start("cache", steps=10, memory_limit=1000, say=said.append)
+    assert "exceed the memory limit" in said[0]
+    assert list((tmp_path / "cache" / "rows").iterdir())
+    assert resume_run(half.run.folder, tiny, steps=20, memory_limit=1000).digest == straight.digest
+
+
+@pytest.mark.parametrize("depth", [0, 5])
+def test_results_do_not_depend_on_prefetching(
+    start: Train, depth: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    expected = start("two", steps=15).digest
+    monkeypatch.setattr("tcmrl_algo.train.PREFETCHED", depth)
+    assert start("other", steps=15).digest == expected
 
 
 def test_the_learning_rate_falls_linearly_to_its_share() -> None:
@@ -351,6 +377,7 @@ def test_train_command_refuses_bad_input_in_one_line(tiny_folder: Path, tmp_path
     assert_refused(call("train", tiny_folder, "--resume", *out), "no run")
     assert_refused(call("train", tiny_folder, "--resume", "--set", "run.steps=3", *out), "--resume")
     assert_refused(call("train", tiny_folder, "--steps", "0", *out), "--steps")
+    assert_refused(call("train", tiny_folder, "--memory-limit", "much", *out), "much", "2G")
     assert not (tmp_path / "run").exists()
 
 

@@ -1,0 +1,212 @@
+"""One entry of the cache: packed rows as files that are mapped into memory.
+
+`rows.f32` is the table, `episodes.i64` holds starts, lengths and task ranges, `record.json` the digest of
+its own text in front of it. An entry is published by one rename after everything in it is forced to disk,
+and never changes. Whoever reads it holds a shared lock on its record.
+"""
+
+import contextlib
+import fcntl
+import os
+import uuid
+import weakref
+from collections.abc import Sequence
+from pathlib import Path
+from typing import IO, TYPE_CHECKING
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from tcmrl_data.canonical import canonical_json, sha256
+from tcmrl_data.publish import (
+    STAGING,
+    disk,
+    lock_file,
+    make_folders,
+    move_into_place,
+    named_errors,
+    remove_tree,
+    write_file,
+)
+from tcmrl_data.rows import (
+    Episodes,
+    Indices,
+    PartRows,
+    Rows,
+    Table,
+    each_part,
+    plan_rows,
+    read_part,
+    selection_rows,
+    table_shape,
+)
+
+if TYPE_CHECKING:
+    from tcmrl_data.dataset import Selection
+
+FORMAT = 1
+"""Raised when the layout of an entry changes; entries of another format are never opened."""
+
+RECORD = "record.json"
+ROWS = "rows.f32"
+EPISODES = "episodes.i64"
+
+
+class EntryRecord(BaseModel):
+    """What an entry holds.
+
+    Attributes:
+        format: FORMAT of the version that wrote it.
+        environment: the dataset's environment.
+        root: Merkle root of the dataset.
+        selection: per task, its index and its snapshot steps.
+        shape: rows and floats per row.
+        episodes: episodes with a step.
+        episodes_sha256: of the file of episodes.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    format: int
+    environment: str
+    root: str
+    selection: tuple[tuple[int, tuple[int, ...]], ...]
+    shape: tuple[int, int]
+    episodes: int
+    episodes_sha256: str
+
+    @property
+    def row_bytes(self) -> int:
+        """Size of the file of rows."""
+        return 4 * self.shape[0] * self.shape[1]
+
+
+def open_entry(entry: Path, selection: "Selection") -> Rows | None:
+    """The rows of an entry, locked as long as its table lives; None where there is no whole entry."""
+    try:
+        file = (entry / RECORD).open("rb")
+    except FileNotFoundError:
+        return None
+    with contextlib.ExitStack() as stack:
+        stack.enter_context(file)
+        fcntl.flock(file, fcntl.LOCK_SH)  # an eviction holds it for a moment only
+        record = read_record(file)
+        if not is_current(file, entry / RECORD) or record is None:
+            return None
+        episodes = _read_episodes(entry / EPISODES, record, len(selection.tasks))
+        if episodes is None or not _has_size(entry / ROWS, record.row_bytes):
+            return None
+        os.utime(entry / RECORD)
+        # copy on write: torch wants memory that could be written, and the file must never be
+        table: Table = np.memmap(entry / ROWS, dtype=np.float32, mode="c", shape=record.shape)
+        weakref.finalize(table, stack.pop_all().close)
+        return selection_rows(selection, table, episodes)
+
+
+def _has_size(path: Path, size: int) -> bool:
+    return path.is_file() and path.stat().st_size == size
+
+
+def is_current(file: IO[bytes], path: Path) -> bool:
+    """Whether the open file is still the one at the path."""
+    return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())
+
+
+def try_lock(file: IO[bytes], kind: int) -> bool:
+    """Locks an open file as fcntl names it, unless another holder is in the way."""
+    try:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
+
+
+def selected(selection: "Selection") -> tuple[tuple[int, tuple[int, ...]], ...]:
+    """A selection in plain terms: per task, its index and its snapshot steps."""
+    return tuple((task.index, selection.steps[task.index]) for task in selection.tasks)
+
+
+def read_record(file: IO[bytes]) -> EntryRecord | None:
+    """The record, if it is whole and of this format."""
+    sealed, _, data = file.read().partition(b"\n")
+    if sha256(data).encode() != sealed:
+        return None
+    try:
+        record = EntryRecord.model_validate_json(data)
+    except ValidationError:
+        return None
+    return record if record.format == FORMAT else None
+
+
+def _read_episodes(file: Path, record: EntryRecord, num_tasks: int) -> Episodes | None:
+    data = file.read_bytes() if file.is_file() else b""
+    if sha256(data) != record.episodes_sha256:
+        return None
+    starts, lengths, ranges = np.split(
+        np.frombuffer(data, dtype=np.int64), [record.episodes, 2 * record.episodes]
+    )
+    return Episodes(starts, lengths, ranges.reshape(num_tasks, 2))
+
+
+def write_entry(folder: Path, entry: Path, selection: "Selection") -> None:
+    """Decodes a selection part by part into a new entry; loses quietly against another process.
+
+    Args:
+        folder: the cache.
+        entry: where the entry is to be.
+        selection: what to decode.
+
+    Raises:
+        StorageError: the disk refused; nothing is published.
+        StoreError: arrays that do not decode or do not form episodes; names the part.
+    """
+    plan = plan_rows(selection)
+    shape = table_shape(selection, plan)
+    make_folders(folder / STAGING)
+    make_folders(entry.parent)
+    staged = folder / STAGING / f"{entry.name}.{uuid.uuid4().hex}"
+    with lock_file(staged.with_name(f"{staged.name}.lock"), "this entry") as lock:
+        try:
+            with named_errors(staged):
+                disk.make_folder(staged)
+                lengths = _write_rows(staged / ROWS, plan, shape)
+            episodes = Episodes.of(lengths, [part.task for part in plan])
+            tables = (episodes.starts, episodes.lengths, episodes.task_ranges)
+            data = b"".join(each.astype(np.int64).tobytes() for each in tables)
+            record = EntryRecord(
+                format=FORMAT,
+                environment=selection.dataset.name,
+                root=selection.dataset.manifest.root,
+                selection=selected(selection),
+                shape=shape,
+                episodes=len(episodes.starts),
+                episodes_sha256=sha256(data),
+            )
+            write_file(staged / EPISODES, data)
+            text = canonical_json(record.model_dump(mode="json"))
+            write_file(staged / RECORD, sha256(text).encode() + b"\n" + text)
+            with named_errors(staged):
+                disk.sync(staged)
+            move_into_place(staged, entry)
+        finally:
+            remove_tree(staged)
+            lock.unlink(missing_ok=True)
+
+
+def _write_rows(file: Path, plan: Sequence[PartRows], shape: tuple[int, int]) -> list[Indices]:
+    """Writes the table with ordinary writes, so that only the parts at work are in memory."""
+    with file.open("xb", buffering=0) as out:
+        out.truncate(4 * shape[0] * shape[1])
+
+        def write(part: PartRows) -> Indices:
+            rows: Table = np.zeros((part.last - part.first, shape[1]), dtype=np.float32)
+            lengths = read_part(part, rows)
+            left, at = memoryview(rows.data).cast("B"), 4 * shape[1] * part.first
+            while left:
+                written = os.pwrite(out.fileno(), left, at)
+                left, at = left[written:], at + written
+            return lengths
+
+        lengths = list(each_part(plan, write))
+    disk.sync(file)
+    return lengths

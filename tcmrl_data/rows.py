@@ -1,0 +1,202 @@
+"""Packed rows: all selected steps in one float32 table, read part by part, several parts at a time."""
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tcmrl_data.errors import StoreError
+from tcmrl_data.store import Arrays, checked_offsets, read_arrays
+
+if TYPE_CHECKING:
+    from tcmrl_data.dataset import Selection
+
+Indices = npt.NDArray[np.int64]
+Table = npt.NDArray[np.float32]
+
+ROW_ARRAYS = ("observations", "actions", "rewards", "terminated", "episode_offsets")
+READERS = 8
+"""Most parts that are read at the same time; each holds its files and its arrays in memory."""
+
+
+@dataclass(frozen=True)
+class Episodes:
+    """Where the episodes of a selection lie; those without a step are left out.
+
+    Attributes:
+        starts: (episodes,) first row of each.
+        lengths: (episodes,) steps of each, at least 1.
+        task_ranges: (tasks, 2) first and last + 1 of each task's episodes.
+    """
+
+    starts: Indices
+    lengths: Indices
+    task_ranges: Indices
+
+    @classmethod
+    def of(cls, lengths: Sequence[Indices], tasks: Sequence[int]) -> "Episodes":
+        """The table of episodes whose rows lie behind one another.
+
+        Args:
+            lengths: of each part's episodes.
+            tasks: position of each part's task, ascending.
+        """
+        flat = np.concatenate(lengths)
+        starts = np.cumsum(flat + 1) - flat - 1
+        owner = np.repeat(tasks, [len(each) for each in lengths])[flat > 0]
+        positions = np.arange(max(tasks) + 1)
+        ranges = np.stack([np.searchsorted(owner, positions, side) for side in ("left", "right")], axis=1)
+        return cls(starts[flat > 0], flat[flat > 0], ranges.astype(np.int64))
+
+    @property
+    def longest(self) -> int:
+        """Steps of the longest episode; 0 where there is none."""
+        return int(self.lengths.max(initial=0))
+
+
+@dataclass(frozen=True)
+class Rows:
+    """All steps of a selection, a row per observation: (observation, action, reward, terminated).
+
+    An episode of T steps takes T + 1 rows, so the next observation is the next row; the last row of an
+    episode holds an observation and zeros. At least as many rows of zeros as the longest episode has steps
+    lie behind the last one, so that a block of that length may start at any episode.
+
+    Attributes:
+        table: (rows, observation_dim + action_dim + 2).
+        episodes: where they lie.
+        observation_dim, action_dim: widths.
+        task_indices: (tasks,) indices of the tasks.
+    """
+
+    table: Table
+    episodes: Episodes
+    observation_dim: int
+    action_dim: int
+    task_indices: Indices
+
+
+@dataclass(frozen=True)
+class PartRows:
+    """The rows that one part fills.
+
+    Attributes:
+        folder: the part.
+        task: position of its task in the selection.
+        first, last: its rows are `first` to `last - 1`.
+    """
+
+    folder: Path
+    task: int
+    first: int
+    last: int
+
+
+def plan_rows(selection: "Selection") -> list[PartRows]:
+    """The parts of a selection and the rows that each will fill, from their records alone.
+
+    Raises:
+        StoreError: a part whose observations or actions are not as wide as the environment's.
+    """
+    dataset, plan, first = selection.dataset, [], 0
+    widths = {
+        "observations": dataset.environment.observation_dim,
+        "actions": dataset.environment.action_dim,
+    }
+    for position, task in enumerate(selection.tasks):
+        for step in selection.steps[task.index]:
+            folder, arrays = (
+                dataset.folder_of(task.index, step),
+                dataset.part(task.index, step).identity.arrays,
+            )
+            for name, width in widths.items():
+                if arrays[name].shape[1] != width:
+                    raise StoreError(
+                        f"{folder}: {name} are {arrays[name].shape[1]} wide, {dataset.name} has {width}; "
+                        "run `tcmrl-data repair`"
+                    )
+            last = first + arrays["observations"].shape[0]
+            plan.append(PartRows(folder, position, first, last))
+            first = last
+    return plan
+
+
+def table_shape(selection: "Selection", plan: Sequence[PartRows]) -> tuple[int, int]:
+    """Shape of a selection's table; no episode is longer than the largest part has rows."""
+    environment = selection.dataset.environment
+    padding = max(part.last - part.first for part in plan)
+    return plan[-1].last + padding, environment.observation_dim + environment.action_dim + 2
+
+
+def read_rows(selection: "Selection") -> Rows:
+    """Reads a selection into memory.
+
+    Raises:
+        StoreError: arrays that do not decode or do not form episodes; names the part.
+    """
+    plan = plan_rows(selection)
+    table: Table = np.zeros(table_shape(selection, plan), dtype=np.float32)
+    lengths = list(each_part(plan, lambda part: read_part(part, table[part.first : part.last])))
+    return selection_rows(selection, table, Episodes.of(lengths, [part.task for part in plan]))
+
+
+def selection_rows(selection: "Selection", table: Table, episodes: Episodes) -> Rows:
+    """The rows of a selection, given the filled table."""
+    environment = selection.dataset.environment
+    indices = np.array([task.index for task in selection.tasks], dtype=np.int64)
+    return Rows(table, episodes, environment.observation_dim, environment.action_dim, indices)
+
+
+def each_part(plan: Sequence[PartRows], read: Callable[[PartRows], Any]) -> Iterator[Any]:
+    """What `read` gives for every part, in order; the first part that fails, fails all."""
+    with ThreadPoolExecutor(min(READERS, len(os.sched_getaffinity(0)))) as pool:
+        yield from pool.map(read, plan)
+
+
+def read_part(part: PartRows, out: Table) -> Indices:
+    """Fills zeroed rows with a part; returns the lengths of its episodes.
+
+    Raises:
+        StoreError: arrays that do not decode or do not form episodes; names the part.
+    """
+    arrays = read_arrays(part.folder, ROW_ARRAYS)
+    try:
+        return fill_rows(out, arrays)
+    except StoreError as error:
+        raise StoreError(f"{part.folder}: {error}; run `tcmrl-data repair`") from None
+
+
+def fill_rows(out: Table, arrays: Arrays) -> Indices:
+    """Writes a part's arrays into its rows, which are zeros; returns the lengths of its episodes.
+
+    Args:
+        out: (observations, width).
+        arrays: as the store has them.
+
+    Raises:
+        StoreError: they do not form episodes, or not as many rows.
+    """
+    observations, actions = arrays["observations"], arrays["actions"]
+    offsets = checked_offsets(arrays["episode_offsets"], len(actions))
+    lengths = np.diff(offsets)
+    if len(observations) != len(actions) + len(lengths) or len(observations) != len(out):
+        raise StoreError(
+            f"{len(observations)} observations do not fit {len(actions)} actions in {len(lengths)} episodes"
+        )
+    for name in ("rewards", "terminated"):
+        if len(arrays[name]) != len(actions):
+            raise StoreError(f"{name} has {len(arrays[name])} steps, actions have {len(actions)}")
+    observation_dim = observations.shape[1]
+    steps = np.arange(len(actions)) + np.repeat(
+        np.arange(len(lengths)), lengths
+    )  # each episode's last row is none
+    out[:, :observation_dim] = observations
+    out[steps, observation_dim:-2] = actions
+    out[steps, -2] = arrays["rewards"]
+    out[steps, -1] = arrays["terminated"]
+    return lengths

@@ -1,0 +1,48 @@
+"""Samplers over episodes made in a test, packed as a dataset's parts are."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from tcmrl_data import BatchSizes, Trajectory
+from tcmrl_data.rows import Episodes, Rows, fill_rows
+from tcmrl_data.sampler import Sampler
+from tcmrl_data.store import pack
+
+
+def rows_of(tasks: Sequence[Sequence[Trajectory]]) -> Rows:
+    """The packed rows of some tasks' episodes, a part per task."""
+    first = tasks[0][0]
+    observation_dim, action_dim = first.observations.shape[1], first.actions.shape[1]
+    counts = [sum(len(each) + 1 for each in task) for task in tasks]
+    table = np.zeros((sum(counts) + max(counts), observation_dim + action_dim + 2), dtype=np.float32)
+    lengths, start = [], 0
+    for task, count in zip(tasks, counts, strict=True):
+        lengths.append(fill_rows(table[start : start + count], pack(task)))
+        start += count
+    episodes = Episodes.of(lengths, range(len(tasks)))
+    return Rows(table, episodes, observation_dim, action_dim, np.arange(len(tasks)))
+
+
+def sampler_of(
+    tasks: Sequence[Sequence[Trajectory]], sizes: BatchSizes, *, seed: int = 0, stream: int = 0
+) -> Sampler:
+    """A sampler over some tasks' episodes."""
+    return Sampler(rows_of(tasks), sizes, seed=seed, stream=stream, environment="memory", place="memory")
+
+
+def numbered(task: int, episode: int, steps: int) -> Trajectory:
+    """An episode whose observations say where they come from: (task, episode, t)."""
+    observations = np.array([[task, episode, t] for t in range(steps + 1)], dtype=np.float32)
+    truncated = np.arange(1, steps + 1) == steps
+    terminated = truncated & (episode % 2 == 0)
+    rewards = observations[:-1] @ np.array([100.0, 10.0, 1.0])
+    return Trajectory(observations, np.zeros((steps, 1)), rewards, terminated, truncated & ~terminated)
+
+
+def numbered_tasks(lengths: Sequence[Sequence[int]]) -> list[list[Trajectory]]:
+    """Numbered episodes of the given lengths, per task."""
+    return [
+        [numbered(task, episode, steps) for episode, steps in enumerate(each)]
+        for task, each in enumerate(lengths)
+    ]

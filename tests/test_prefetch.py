@@ -1,0 +1,67 @@
+"""Making batches ahead: order, bound, errors, and the end of the thread."""
+
+import threading
+import time
+
+import pytest
+
+from tcmrl_data import BatchSizes, Prefetch
+from tests.sampling import numbered_tasks, sampler_of
+
+
+def threads() -> int:
+    return sum(each.name == "prefetch" for each in threading.enumerate())
+
+
+@pytest.mark.parametrize("depth", [0, 1, 2, 7])
+def test_items_come_in_order_whatever_the_depth(depth: int) -> None:
+    with Prefetch(lambda n: n * n, range(3, 40), depth=depth) as items:
+        assert list(items) == [n * n for n in range(3, 40)]
+        assert items.waited > 0
+        with pytest.raises(StopIteration):
+            next(items)
+    assert threads() == 0
+
+
+@pytest.mark.parametrize("depth", [0, 1, 3])
+def test_batches_are_the_same_whatever_the_depth(depth: int) -> None:
+    sampler = sampler_of(numbered_tasks([[5, 6, 7]] * 3), BatchSizes(transitions=8))
+    with sampler.prefetch(4, 30, depth=depth) as batches:
+        for n, batch in zip(range(4, 30), batches, strict=True):
+            expected = sampler.batch(n)
+            assert batch.transitions.observations.equal(expected.transitions.observations)
+            assert batch.context.rewards.equal(expected.context.rewards)
+
+
+def test_no_more_are_made_than_the_depth_and_the_one_at_work() -> None:
+    made: list[int] = []
+    with Prefetch(lambda n: made.append(n) or n, range(100), depth=2) as items:
+        assert next(items) == 0
+        deadline = time.monotonic() + 10
+        while len(made) < 4 and time.monotonic() < deadline:
+            time.sleep(0.001)
+        time.sleep(0.02)
+        assert made == [0, 1, 2, 3]  # one taken, two waiting, one made and not put
+
+
+@pytest.mark.parametrize("depth", [0, 2])
+def test_an_error_comes_where_its_item_would(depth: int) -> None:
+    def make(n: int) -> int:
+        if n == 3:
+            raise ValueError("three")
+        return n
+
+    with Prefetch(make, range(10), depth=depth) as items:
+        assert [next(items) for _ in range(3)] == [0, 1, 2]
+        with pytest.raises(ValueError, match="three"):
+            next(items)
+    assert threads() == 0
+
+
+def test_leaving_early_ends_the_thread() -> None:
+    with Prefetch(lambda n: n, range(10**9), depth=2) as items:
+        next(items)
+        assert threads() == 1
+    assert threads() == 0
+    with pytest.raises(StopIteration):
+        next(items)
