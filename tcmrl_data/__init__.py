@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from tcmrl_data.build import BuildReport, build_dataset
     from tcmrl_data.cache import CacheEntry, cache_folder, cache_limit, clear_cache, list_cache, parse_bytes
     from tcmrl_data.canonical import canonical_json, parse_json
-    from tcmrl_data.dataset import Dataset, Selection, open_dataset
+    from tcmrl_data.dataset import Dataset, open_dataset
     from tcmrl_data.discovery import plugin
     from tcmrl_data.environment import (
         Controller,
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from tcmrl_data.rollout import roll_out
     from tcmrl_data.sampler import Sampler
     from tcmrl_data.seeding import NO_TASK, Purpose, keyed_generator, keyed_seed
+    from tcmrl_data.selection import Selection
     from tcmrl_data.snapshot import import_sac
     from tcmrl_data.tasks import Task, draw_tasks, parse_indices
     from tcmrl_data.trajectory import Trajectory
@@ -53,7 +54,7 @@ _HOMES = {
     "build": ("BuildReport", "build_dataset"),
     "cache": ("CacheEntry", "cache_folder", "cache_limit", "clear_cache", "list_cache", "parse_bytes"),
     "canonical": ("canonical_json", "parse_json"),
-    "dataset": ("Dataset", "Selection", "open_dataset"),
+    "dataset": ("Dataset", "open_dataset"),
     "discovery": ("plugin",),
     "environment": (
         "Controller",
@@ -71,6 +72,7 @@ _HOMES = {
     "plan": ("Plan", "plan_build"),
     "prefetch": ("Prefetch",),
     "recipe": ("PROFILES", "Recipe", "apply_overrides", "first_problem", "list_environments", "load_recipe"),
+    "selection": ("Selection",),
     "repair": ("RepairReport", "repair_dataset"),
     "replay": ("Replay",),
     "returns": ("return_table",),

@@ -31,7 +31,7 @@ from tcmrl_data.publish import LOCK, STAGING, lock_file, make_folders, remove_ab
 from tcmrl_data.rows import Rows, plan_rows, read_rows, table_shape
 
 if TYPE_CHECKING:
-    from tcmrl_data.dataset import Selection
+    from tcmrl_data.selection import Selection
 
 CACHE_BYTES = 100 * 10**9
 """What all entries may take, unless TCMRL_CACHE_LIMIT says otherwise (such as 20G)."""

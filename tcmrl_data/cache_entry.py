@@ -42,7 +42,7 @@ from tcmrl_data.rows import (
 )
 
 if TYPE_CHECKING:
-    from tcmrl_data.dataset import Selection
+    from tcmrl_data.selection import Selection
 
 FORMAT = 1
 """Raised when the layout of an entry changes; entries of another format are never opened."""

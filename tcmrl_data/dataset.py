@@ -1,13 +1,10 @@
-"""Reading: `open_dataset` → `Dataset` → `Selection`; views over parts, loaded only when asked for."""
+"""Reading: `open_dataset` → `Dataset`; parts are loaded only when asked for."""
 
 import functools
-import re
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
@@ -26,13 +23,13 @@ from tcmrl_data.manifest import (
 from tcmrl_data.part_files import check_files
 from tcmrl_data.plain_files import folder_problem
 from tcmrl_data.recipe import first_problem
+from tcmrl_data.selection import Selection, chosen_steps
 from tcmrl_data.snapshot import Snapshot, read_snapshot
 from tcmrl_data.store import read_arrays, unpack
 from tcmrl_data.tasks import Split, Task
 from tcmrl_data.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from tcmrl_data.sampler import BatchSizes, Sampler
     from tcmrl_data.torch_dataset import TrajectoryDataset
 
 
@@ -186,7 +183,7 @@ class Dataset:
 
     def select(
         self, *, split: Split | None = None, tasks: Sequence[int] | None = None, snapshots: str = "all"
-    ) -> "Selection":
+    ) -> Selection:
         """A view of some tasks and snapshots.
 
         Args:
@@ -206,7 +203,7 @@ class Dataset:
                 f"{self.folder}: no {split or 'such'} tasks in the dataset; build some with --tasks"
             )
         return Selection(
-            self, tuple(chosen), {task.index: self._steps(task.index, snapshots) for task in chosen}
+            self, tuple(chosen), {task.index: chosen_steps(self, task.index, snapshots) for task in chosen}
         )
 
     def to_torch_dataset(
@@ -220,103 +217,3 @@ class Dataset:
         """`select(...)`, then `Selection.to_torch_dataset`."""
         selection = self.select(split=split, tasks=tasks, snapshots=snapshots)
         return selection.to_torch_dataset(kept_parts=kept_parts)
-
-    def _steps(self, task: int, rule: str) -> tuple[int, ...]:
-        steps = self.snapshots(task)
-        missing = sorted(set(self.manifest.steps) - set(steps))
-        if missing:
-            raise SelectionError(
-                f"{self.folder}: task {task} lacks snapshots {missing}; finish it with `tcmrl-data build`"
-            )
-        match = re.fullmatch(r"all|last|steps>=(\d+)|return>=(0(?:\.\d+)?|1(?:\.0+)?)", rule.replace(" ", ""))
-        if match is None:
-            raise SelectionError(
-                f"snapshots {rule!r}: expected all, last, steps>=N or return>=Q with Q in [0, 1]"
-            )
-        if rule == "last":
-            steps = steps[-1:]
-        elif match[1]:
-            steps = [step for step in steps if step >= int(match[1])]
-        elif match[2]:
-            means = {step: self.part(task, step).statistics.mean for step in steps}
-            threshold = np.quantile(list(means.values()), float(match[2]))
-            steps = [step for step in steps if means[step] >= threshold]
-        if not steps:
-            raise SelectionError(
-                f"{self.folder}: snapshots {rule!r} leaves nothing of task {task}, "
-                f"which has {list(self.manifest.steps)}"
-            )
-        return tuple(steps)
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Some tasks and snapshots of a dataset; a view, nothing is loaded.
-
-    Attributes:
-        dataset: where it comes from.
-        tasks: the selected tasks.
-        steps: task index to snapshot steps.
-    """
-
-    dataset: Dataset
-    tasks: tuple[Task, ...]
-    steps: dict[int, tuple[int, ...]]
-
-    def to_torch_dataset(self, *, kept_parts: int | None = None) -> "TrajectoryDataset":
-        """The selected episodes as a map-style `torch.utils.data.Dataset`; parts are read when asked for.
-
-        Args:
-            kept_parts: parts that stay in memory after they were read; all of them where None.
-        """
-        from tcmrl_data.torch_dataset import TrajectoryDataset
-
-        return TrajectoryDataset(self, kept_parts=kept_parts)
-
-    def trajectories(self, task: int) -> list[Trajectory]:
-        """All selected episodes of a task, snapshot by snapshot."""
-        return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
-
-    def sampler(
-        self,
-        sizes: "BatchSizes",
-        *,
-        seed: int,
-        stream: int = 0,
-        device: str = "cpu",
-        memory_limit: int | None = None,
-        say: Callable[[str], None] = lambda message: None,
-    ) -> "Sampler":
-        """Loads the selection once and serves meta-training batches from it.
-
-        Args:
-            sizes: what a batch holds.
-            seed: of the run; batch n is a function of (seed, stream, n).
-            stream: further streams of batches under the same seed.
-            device: where batches are to be.
-            memory_limit: bytes that the decoded steps may take in memory, half of what is available if left
-                out; larger selections are decoded into the cache once and read from there.
-            say: told when the cache is used.
-
-        Raises:
-            SelectionError: the selection holds test tasks, fewer than two tasks, or too little of one.
-        """
-        from tcmrl_data.cache import load_rows
-        from tcmrl_data.sampler import Sampler
-
-        test = [task.index for task in self.tasks if task.split == "test"]
-        if test:
-            raise SelectionError(f"test tasks {test} must not be trained on; select split='train'")
-        if len(self.tasks) < 2:
-            raise SelectionError(
-                f"meta-training needs at least 2 training tasks, the selection has {len(self.tasks)}"
-            )
-        return Sampler(
-            load_rows(self, memory_limit=memory_limit, say=say),
-            sizes,
-            seed=seed,
-            stream=stream,
-            environment=self.dataset.name,
-            place=str(self.dataset.folder),
-            device=device,
-        )

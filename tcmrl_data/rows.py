@@ -14,7 +14,7 @@ from tcmrl_data.errors import StoreError
 from tcmrl_data.store import Arrays, checked_offsets, read_arrays
 
 if TYPE_CHECKING:
-    from tcmrl_data.dataset import Selection
+    from tcmrl_data.selection import Selection
 
 Indices = npt.NDArray[np.int64]
 Table = npt.NDArray[np.float32]

@@ -15,7 +15,7 @@ from torch.utils.data import Dataset
 from tcmrl_data.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from tcmrl_data.dataset import Selection
+    from tcmrl_data.selection import Selection
 
 Item = dict[str, Tensor]
 

@@ -20,9 +20,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.dataset import Dataset, Selection
+from tcmrl_data.dataset import Dataset
 from tcmrl_data.errors import StoreError
 from tcmrl_data.interchange._new_folder import new_folder
+from tcmrl_data.selection import Selection
 from tcmrl_data.tasks import Task
 from tcmrl_data.trajectory import Trajectory
 

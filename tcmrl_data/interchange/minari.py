@@ -23,12 +23,13 @@ import numpy as np
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 
-from tcmrl_data.dataset import Dataset, Selection
+from tcmrl_data.dataset import Dataset
 from tcmrl_data.environment import make_environment
 from tcmrl_data.errors import MissingPackageError, StoreError
 from tcmrl_data.interchange._new_folder import new_folder
 from tcmrl_data.manifest import TaskReferences
 from tcmrl_data.seeding import Purpose, keyed_seed
+from tcmrl_data.selection import Selection
 from tcmrl_data.tasks import Task
 from tcmrl_data.trajectory import Trajectory
 

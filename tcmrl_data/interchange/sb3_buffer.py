@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from gymnasium.spaces import Box
 
-from tcmrl_data.dataset import Selection
 from tcmrl_data.errors import SelectionError
+from tcmrl_data.selection import Selection
 
 if TYPE_CHECKING:
     from stable_baselines3.common.buffers import ReplayBuffer

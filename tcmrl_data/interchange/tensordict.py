@@ -4,8 +4,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from tcmrl_data.dataset import Selection
 from tcmrl_data.errors import MissingPackageError
+from tcmrl_data.selection import Selection
 
 if TYPE_CHECKING:
     import torch
