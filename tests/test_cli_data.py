@@ -9,6 +9,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import click
 import numpy as np
 import pytest
 from tcmrl_cli.data import data
@@ -339,12 +340,10 @@ def test_a_bad_manifest_is_refused_by_every_command(
 
 def test_every_help_has_an_example(call: Call) -> None:
     for name, command in data.commands.items():
-        if name == "inspect":
-            continue
-        assert "Example" in call(name, "--help")[1]
+        within = list(command.commands) if isinstance(command, click.Group) else []
+        for words in [[name, each] for each in within] or [[name]]:
+            assert "Example" in call(*words, "--help")[1]
         assert command.help
-    for name in ("returns", "tasks", "snapshots", "episodes"):
-        assert "Example" in call("inspect", name, "--help")[1]
 
 
 def test_no_arguments_prints_help_and_exits_with_two(call: Call) -> None:
