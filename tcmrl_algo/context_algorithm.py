@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from tcmrl_algo.networks import Attention
 from tcmrl_algo.problem import Algorithm
 from tcmrl_data import Controller, Steps, Trajectory
 
@@ -25,6 +26,10 @@ class ContextAlgorithm(Algorithm):
         self, observations: Float[Tensor, "lanes observation"], context: Float[Tensor, "lanes latent"]
     ) -> Float[Tensor, "lanes action"]:
         """Deterministic actions in [-1, 1]."""
+
+    def attention(self, trajectories: Sequence[Sequence[Trajectory]]) -> Attention | None:
+        """How each lane's transitions weigh in its context; None where a method has no attention."""
+        return None
 
     def adapt(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         return ContextController(self, self.context(trajectories))

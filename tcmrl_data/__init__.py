@@ -12,6 +12,8 @@ if TYPE_CHECKING:
     from tcmrl_data.canonical import canonical_json, parse_json
     from tcmrl_data.dataset import Dataset, Selection, list_datasets, open_dataset
     from tcmrl_data.discovery import plugin
+    from tcmrl_data.engine import Unit
+    from tcmrl_data.engine.worker import serve
     from tcmrl_data.environment import (
         Controller,
         Environment,
@@ -49,6 +51,8 @@ _HOMES = {
     "canonical": ("canonical_json", "parse_json"),
     "dataset": ("Dataset", "Selection", "list_datasets", "open_dataset"),
     "discovery": ("plugin",),
+    "engine": ("Unit",),
+    "engine.worker": ("serve",),
     "environment": (
         "Controller",
         "Environment",
@@ -107,6 +111,7 @@ __all__ = [
     "TrainingError",
     "Trajectory",
     "UniformController",
+    "Unit",
     "VerifyLevel",
     "VerifyReport",
     "apply_overrides",
@@ -132,6 +137,7 @@ __all__ = [
     "repair_dataset",
     "return_table",
     "roll_out",
+    "serve",
     "verify_dataset",
 ]
 

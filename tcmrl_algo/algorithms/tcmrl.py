@@ -253,9 +253,12 @@ class Tcmrl(ContextAlgorithm):
         return losses.distance_metric_loss(contexts, tasks)
 
     def context(self, trajectories: Sequence[Sequence[Trajectory]]) -> Float[Tensor, "lanes latent"]:
+        return self.attention(trajectories).context
+
+    def attention(self, trajectories: Sequence[Sequence[Trajectory]]) -> Attention:
         with torch.no_grad():
             steps = self.learner.standardized(pack(trajectories, self._problem.device))
-            return self.learner.attend(self.learner.encode(steps), steps.mask).context
+            return self.learner.attend(self.learner.encode(steps), steps.mask)
 
     def policy(
         self, observations: Float[Tensor, "lanes observation"], context: Float[Tensor, "lanes latent"]
