@@ -32,7 +32,7 @@ def recipe_options(command: Command) -> Command:
         click.argument("environment", metavar="ENV"),
         click.option(
             "--profile",
-            type=click.Choice(["paper", "quick"]),
+            type=click.Choice(["paper", "quick", "reduced"]),
             default="paper",
             show_default=True,
             help="The recipe as written, or its smaller form.",
@@ -40,7 +40,7 @@ def recipe_options(command: Command) -> Command:
         click.option(
             "--behavior",
             metavar="SOURCE",
-            help="Where the policies come from, such as sac or scripted; the recipe's choice if left out.",
+            help="Where the policies come from: stacked, sac or scripted; the recipe's choice if left out.",
         ),
         click.option(
             "--tasks",
@@ -113,6 +113,7 @@ def plan(
         "environment steps of training": f"{planned.training_steps:,}",
         "stored environment steps": f"{planned.rollout_steps:,} at most",
         "size": f"{size(planned.bytes)} at most",
+        "memory": f"{size(planned.unit_bytes)} per worker at most",
         "time": f"about {duration(planned.seconds)} with {planned.workers} workers",
     }
     for name, value in rows.items():

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from tcmrl_algo import Progress, TrainingReport
     from tcmrl_data import Dataset
 
-Profile = Literal["paper", "quick"]
+Profile = Literal["paper", "quick", "reduced"]
 Protocol = Literal["paper", "offline", "idaq"]
 
 

@@ -13,11 +13,11 @@ from tcmrl_data.engine import BaseEngine
 from tcmrl_data.errors import BuildError, StorageError
 from tcmrl_data.events import EVENTS, BuildEvent, EventLog
 from tcmrl_data.manifest import DATA_VERSION, MANIFEST, read_manifest
+from tcmrl_data.part import part_bytes
 from tcmrl_data.publish import CHECKPOINTS, LOCK, STAGING, lock_file, make_folders, remove_abandoned
 from tcmrl_data.recipe import Recipe
 from tcmrl_data.scan import check_work_files
 from tcmrl_data.tasks import Task, choose_tasks
-from tcmrl_data.unit import part_bytes
 
 OWN_FILES = {MANIFEST, LOCK, STAGING, CHECKPOINTS, EVENTS, "zarr.json", "tasks"}
 
@@ -29,7 +29,7 @@ class BuildReport:
     Attributes:
         built: parts made now.
         present: parts that were there and whose digests held.
-        failed: one line per task that failed.
+        failed: one line per unit that failed.
         root: Merkle root of the dataset as it now stands.
     """
 

@@ -16,6 +16,8 @@ from tcmrl_data.canonical import canonical_json, parse_json, sha256
 from tcmrl_data.publish import CHECKPOINTS, STAGING, remove_tree, replace_file
 
 CHECKPOINT_SECONDS = 60.0
+CHECKPOINT_SHARE = 0.05
+"""Most of the time that may go into checkpoints."""
 
 
 @dataclass(frozen=True)
@@ -47,16 +49,17 @@ class CheckpointFolder:
     ) -> None:
         self._dataset, self._folder = dataset, dataset / CHECKPOINTS / unit
         self._key, self._before = key, before
-        self._seconds, self._saved = seconds, time.monotonic()
+        self._seconds, self._saved, self._cost = seconds, time.monotonic(), 0.0
 
     def is_due(self) -> bool:
-        """It is time for a checkpoint."""
-        return time.monotonic() - self._saved >= self._seconds
+        """It is time for a checkpoint: large ones come more rarely, so that they cost little of the time."""
+        return time.monotonic() - self._saved >= max(self._seconds, self._cost / CHECKPOINT_SHARE)
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Puts a checkpoint in the place of the last one."""
         from safetensors.numpy import save
 
+        began = time.monotonic()
         header = canonical_json({"key": self._key, "values": checkpoint.values}).decode()
         data = save(dict(checkpoint.arrays), metadata={"state": header})
         earlier = self._files()
@@ -64,6 +67,7 @@ class CheckpointFolder:
         for file in earlier:
             file.unlink(missing_ok=True)  # the same unit may run twice at once
         self._saved = time.monotonic()
+        self._cost = self._saved - began
 
     def load(self) -> Checkpoint | None:
         """The last checkpoint, or None where there is none to trust."""

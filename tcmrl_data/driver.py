@@ -25,8 +25,8 @@ from tcmrl_data.manifest import (
 )
 from tcmrl_data.publish import STAGING, make_folders, replace_file
 from tcmrl_data.recipe import Recipe
-from tcmrl_data.tasks import Task
-from tcmrl_data.unit import UnitSpec, behavior_source
+from tcmrl_data.tasks import Task, group_tasks
+from tcmrl_data.unit import UnitSpec, behavior_source, unit_memory
 
 MANIFEST_SECONDS = 1.0
 """The manifest is rewritten at most this often while parts arrive, and at the end."""
@@ -60,9 +60,14 @@ class Driver:
         However it ends, the manifest then names every part that was taken in.
         """
         missing = [task for task in self._tasks.values() if not self._is_done(task.index)]
-        units = [self._unit(task) for task in sorted(missing, key=lambda task: task.index)]
-        index_of = {_unit_id(task.index): task.index for task in missing}
-        self._steps_total = self._source.training_steps * len(units)
+        groups = [
+            group
+            for group in group_tasks(self._tasks.values(), self._source.group_size)
+            if not all(self._is_done(task.index) for task in group)
+        ]
+        tasks_of = {_unit_id(group): group for group in groups}
+        units = [self._unit(group) for group in groups]
+        self._steps_total = self._source.training_steps * sum(len(group) for group in groups)
         _make_groups(self._out, missing)
         failures: list[str] = []
         try:
@@ -71,7 +76,8 @@ class Driver:
             results = engine.run(units, lambda unit, message: self._on_message(unit, message, log))
             with contextlib.closing(results):
                 for result in results:
-                    self._take_in_published(index_of[result.id])
+                    for task in tasks_of[result.id]:
+                        self._take_in_published(task.index)
                     if result.ok:
                         log.write(self._event("unit_done", f"{result.id} done", result.id))
                     else:
@@ -83,19 +89,20 @@ class Driver:
             raise
         finally:
             self.write_manifest()
-            log.write(self._event("end", f"{len(self.parts)} parts, {len(failures)} tasks failed"))
+            log.write(self._event("end", f"{len(self.parts)} parts, {len(failures)} units failed"))
         return tuple(sorted(failures))
 
-    def _unit(self, task: Task) -> Unit:
-        spec = UnitSpec(self._out.resolve(), self._recipe, self._seed, (task,))
+    def _unit(self, tasks: tuple[Task, ...]) -> Unit:
+        """The unit of a group; done tasks stay in it, since a group's composition may change rounding."""
+        spec = UnitSpec(self._out.resolve(), self._recipe, self._seed, tasks)
         asked = self._recipe.build
         return Unit(
-            _unit_id(task.index),
+            _unit_id(tasks),
             spec.to_json(),
-            cost=self._source.training_steps,
+            cost=self._source.training_steps * len(tasks),
             cpus=asked.cpus,
             gpus=asked.gpus,
-            memory=asked.memory,
+            memory=max(asked.memory, unit_memory(self._recipe, len(tasks))),
             timeout=asked.timeout,
         )
 
@@ -191,8 +198,9 @@ def check_part(folder: Path) -> PartRecord:
     return record
 
 
-def _unit_id(task: int) -> str:
-    return f"task {task}"
+def _unit_id(tasks: Sequence[Task]) -> str:
+    first, last = tasks[0].index, tasks[-1].index
+    return f"task {first}" if len(tasks) == 1 else f"{len(tasks)} tasks from {first} to {last}"
 
 
 def _failure(result: Result) -> str:

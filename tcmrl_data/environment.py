@@ -107,6 +107,10 @@ class Lanes(abc.ABC):
         """Starts one episode per lane; full observations (lanes, observation_dim)."""
 
     @abc.abstractmethod
+    def reset_lane(self, lane: int, seed: int) -> FloatArray:
+        """Starts a new episode in one lane, the others go on; its full observation (observation_dim,)."""
+
+    @abc.abstractmethod
     def step(self, actions: FloatArray, active: BoolArray) -> LaneStep:
         """Steps the active lanes with actions (lanes, action_dim) in [-1, 1]."""
 
@@ -127,6 +131,8 @@ class Environment(abc.ABC):
     action_dim: int
     extras: ClassVar[Mapping[str, type[np.generic]]] = {}
     """Per-step arrays beside the standard ones, name to dtype."""
+    simulator_bytes: ClassVar[int] = 0
+    """Memory of one simulated task, as measured; 0 where a task is a handful of numbers."""
 
     def __init__(self, settings: EnvironmentSettings) -> None:
         self.settings = settings
@@ -149,9 +155,9 @@ class Environment(abc.ABC):
                 the same as `stored` elsewhere.
         """
 
-    def lanes(self, parameters: Sequence[Parameters]) -> Lanes:
-        """One lane per entry: full view, stored reward."""
-        return EnvironmentLanes(self, parameters)
+    def lanes(self, parameters: Sequence[Parameters], *, reward: Reward = "stored") -> Lanes:
+        """One lane per entry: full view, `reward` as for `make`."""
+        return EnvironmentLanes(self, parameters, reward)
 
     def stored_view(self, observations: FloatArray) -> FloatArray:
         """Hides what the task hides from full observations (..., observation_dim)."""
@@ -174,16 +180,21 @@ class Environment(abc.ABC):
 class EnvironmentLanes(Lanes):
     """Lanes over single Gymnasium environments, stepped one after another."""
 
-    def __init__(self, environment: Environment, parameters: Sequence[Parameters]) -> None:
+    def __init__(self, environment: Environment, parameters: Sequence[Parameters], reward: Reward) -> None:
         self.num_lanes = len(parameters)
         self._extras = environment.extras
-        self._environments = [environment.make(each, view="full") for each in parameters]
+        self._environments = [environment.make(each, view="full", reward=reward) for each in parameters]
         self._observations = np.zeros((self.num_lanes, environment.observation_dim))
 
     def reset(self, seeds: Sequence[int]) -> FloatArray:
-        for lane, (environment, seed) in enumerate(zip(self._environments, seeds, strict=True)):
-            self._observations[lane] = environment.reset(seed=seed)[0]
+        for lane, seed in zip(range(self.num_lanes), seeds, strict=True):
+            self.reset_lane(lane, seed)
         return self._observations.copy()
+
+    def reset_lane(self, lane: int, seed: int) -> FloatArray:
+        self._observations[lane] = self._environments[lane].reset(seed=seed)[0]
+        observation: FloatArray = self._observations[lane].copy()
+        return observation
 
     def step(self, actions: FloatArray, active: BoolArray) -> LaneStep:
         rewards = np.zeros(self.num_lanes)

@@ -11,11 +11,12 @@ from pathlib import Path
 from tcmrl_data.behavior import BehaviorContext
 from tcmrl_data.checkpoints import CheckpointFolder
 from tcmrl_data.environment import Environment, UniformController
+from tcmrl_data.part import part_bytes
 from tcmrl_data.recipe import Recipe
 from tcmrl_data.rollout import roll_out
 from tcmrl_data.seeding import Purpose, keyed_generator, keyed_seed
-from tcmrl_data.tasks import Task, choose_tasks
-from tcmrl_data.unit import behavior_source, part_bytes
+from tcmrl_data.tasks import Task, choose_tasks, group_tasks
+from tcmrl_data.unit import behavior_source, unit_memory
 
 PROBE_SECONDS = 6.0
 UNIT_START_SECONDS = 3.0
@@ -30,6 +31,7 @@ class Plan:
         training_steps: environment steps of behavior training, all tasks together.
         rollout_steps: stored environment steps, at most; episodes may end early.
         bytes: size of the arrays before compression, an upper bound.
+        unit_bytes: most memory that a worker takes.
         seconds: estimated wall time with `workers` processes on this machine.
     """
 
@@ -46,6 +48,7 @@ class Plan:
     rollout_steps: int
     bytes: int
     workers: int
+    unit_bytes: int
     seconds: float
 
 
@@ -64,11 +67,11 @@ def plan_build(recipe: Recipe, *, tasks: Sequence[int] | None = None, workers: i
     workers = workers or os.cpu_count() or 1
     episodes, horizon = recipe.rollouts.episodes, environment.settings.horizon
     parts = len(chosen) * len(source.steps)
-    unit_seconds = (
-        UNIT_START_SECONDS
-        + source.training_steps * _training_seconds_per_step(recipe, environment, chosen[0])
-        + len(source.steps) * episodes * _seconds_per_episode(recipe, environment, chosen[0])
-    )
+    groups = group_tasks(chosen, source.group_size)
+    largest = max(groups, key=len)
+    task_seconds = source.training_steps * _training_seconds_per_step(recipe, environment, largest)
+    task_seconds += len(source.steps) * episodes * _seconds_per_episode(recipe, environment, chosen[0])
+    unit_seconds = UNIT_START_SECONDS + len(largest) * task_seconds
     return Plan(
         environment=environment.name,
         profile=recipe.profile,
@@ -83,12 +86,13 @@ def plan_build(recipe: Recipe, *, tasks: Sequence[int] | None = None, workers: i
         rollout_steps=parts * episodes * horizon,
         bytes=parts * part_bytes(recipe),
         workers=workers,
-        seconds=unit_seconds * math.ceil(len(chosen) / workers),
+        unit_bytes=unit_memory(recipe, len(largest)),
+        seconds=unit_seconds * math.ceil(len(groups) / workers),
     )
 
 
-def _training_seconds_per_step(recipe: Recipe, environment: Environment, task: Task) -> float:
-    """Measured on a real training of the task, at the end of the probe, when the warm-up is over."""
+def _training_seconds_per_step(recipe: Recipe, environment: Environment, tasks: Sequence[Task]) -> float:
+    """Measured on a real training of the tasks, at the end of the probe, when the warm-up is over."""
     marks: list[tuple[float, int]] = []
     started = time.monotonic()
 
@@ -100,12 +104,12 @@ def _training_seconds_per_step(recipe: Recipe, environment: Environment, task: T
 
     context = BehaviorContext(
         environment=environment,
-        tasks=[task],
+        tasks=tasks,
         seed=0,
         observation=recipe.behavior["observation"],
         reward=recipe.behavior["reward"],
         report=report,
-        checkpoints=lambda task: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
+        checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
     )
     with contextlib.suppress(_ProbeOverError):
         for _ in behavior_source(recipe).snapshots(context):

@@ -3,6 +3,7 @@
 import datetime
 import platform
 import socket
+from collections.abc import Mapping
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -18,8 +19,8 @@ def package_versions() -> dict[str, str]:
     return {name: version(name) for name in PACKAGES}
 
 
-def provenance(environment: Environment) -> dict[str, Any]:
-    """Where, when and with what a part was made."""
+def provenance(environment: Environment, behavior: Mapping[str, Any]) -> dict[str, Any]:
+    """Where, when and with what a part was made; `behavior` is what its source has recorded."""
     return {
         "created": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "host": socket.gethostname(),
@@ -28,6 +29,7 @@ def provenance(environment: Environment) -> dict[str, Any]:
         "python": platform.python_version(),
         "packages": package_versions(),
         "physics": environment.fingerprint(),
+        "behavior": dict(behavior),
     }
 
 

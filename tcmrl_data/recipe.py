@@ -13,8 +13,8 @@ from tcmrl_data.discovery import plugin
 from tcmrl_data.environment import Environment, environment_type, environment_types, make_environment
 from tcmrl_data.errors import RecipeError
 
-Profile = Literal["paper", "quick"]
-PROFILES: tuple[Profile, ...] = ("paper", "quick")
+Profile = Literal["paper", "quick", "reduced"]
+PROFILES: tuple[Profile, ...] = ("paper", "quick", "reduced")
 RECIPE_SCHEMA = 1
 TABLES = {"about", "environment", "behavior", "rollouts", "build", "training"}
 Table = TypeVar("Table", bound=BaseModel)
@@ -52,15 +52,15 @@ class Rollouts(_Table):
 
 
 class TaskChoice(_Table):
-    """The `[build]` table: which tasks, and what each takes; no part of any digest.
+    """The `[build]` table: which tasks, and what a unit takes; no part of any digest.
 
     Attributes:
         train_tasks: how many, evenly spaced; all where unset.
         test_tasks: how many, evenly spaced; all where unset.
-        cpus: cores that a cluster reserves for a task.
-        gpus: graphics processors that a cluster reserves for a task; a fraction shares one.
-        memory: bytes that a cluster reserves for a task.
-        timeout: seconds after which an attempt at a task is ended; no limit where unset.
+        cpus: cores that a cluster reserves for a unit, a task or a group of tasks.
+        gpus: graphics processors that a cluster reserves for a unit; a fraction shares one.
+        memory: bytes that a cluster reserves for a unit, where more than planned.
+        timeout: seconds after which an attempt at a unit is ended; no limit where unset.
     """
 
     train_tasks: int | None = Field(default=None, ge=2)
@@ -139,17 +139,22 @@ def load_recipe(
 
     Args:
         name: the environment, such as `point-robot` or `ml1/reach`.
-        profile: `paper` is the recipe as written; `quick` merges its `[profiles.quick]` tables on top.
+        profile: `paper` is the recipe as written; another merges its `[profiles.<name>]` tables on top.
         overrides: `section.key=value` texts, applied last.
         behavior: behavior source instead of the recipe's.
 
     Raises:
         UnknownNameError: no such environment or behavior source.
-        RecipeError: an unknown key, a wrong type, or values that contradict each other.
+        RecipeError: a profile that the recipe lacks, an unknown key, a wrong type, or values that
+            contradict each other.
     """
     kind = environment_type(name)
     document = _read(name)
     place = f"recipe of {name!r}, profile {profile!r}"
+    if profile not in _profiles(document):
+        raise RecipeError(
+            f"recipe of {name!r} has no profile {profile!r}; known are {', '.join(_profiles(document))}"
+        )
     tables = apply_overrides(_profile(document, profile), overrides)
     unknown = sorted(set(tables) - TABLES)
     if unknown:
@@ -157,16 +162,9 @@ def load_recipe(
     if behavior is not None:
         tables["behavior"]["source"] = behavior
     chosen = _validated(_Behavior, _without_tables(tables["behavior"]), f"{place}, [behavior]")
-    settings_type = plugin("tcmrl_data.behavior", "behavior source", chosen.source).Settings
-    if chosen.source not in tables["behavior"]:
-        raise RecipeError(
-            f"{place}: behavior source {chosen.source!r} has no [behavior.{chosen.source}] table"
-        )
-    settings = _validated(
-        settings_type, tables["behavior"][chosen.source], f"{place}, [behavior.{chosen.source}]"
-    )
+    settings = _behavior_settings(tables["behavior"], chosen.source, place)
     environment = _validated(kind.Settings, tables["environment"] | {"name": name}, f"{place}, [environment]")
-    training = {each: _profile(document, each).get("training", {}) for each in PROFILES}
+    training = {each: _profile(document, each).get("training", {}) for each in _profiles(document)}
     training[profile] = tables.get("training", {})
     return Recipe(
         profile=profile,
@@ -222,6 +220,16 @@ def _validated(kind: type[Table], values: Mapping[str, Any], place: str) -> Tabl
         raise RecipeError(f"{place}: {first_problem(error)}") from None
 
 
+def _behavior_settings(tables: Mapping[str, Any], source: str, place: str) -> BaseModel:
+    """The source's settings: its own table, on top of that of the source whose settings it shares."""
+    module = plugin("tcmrl_data.behavior", "behavior source", source)
+    if source not in tables:
+        raise RecipeError(f"{place}: behavior source {source!r} has no [behavior.{source}] table")
+    values = _merged(tables.get(getattr(module, "EXTENDS", source), {}), tables[source])
+    settings: BaseModel = _validated(module.Settings, values, f"{place}, [behavior.{source}]")
+    return settings
+
+
 def _recipe_file(name: str) -> Traversable:
     return importlib.resources.files("tcmrl_manifests") / f"{name.partition('/')[0]}.toml"
 
@@ -235,6 +243,11 @@ def _read(name: str) -> dict[str, Any]:
     if schema != RECIPE_SCHEMA:
         raise RecipeError(f"{file.name}: schema {schema!r} is not {RECIPE_SCHEMA}")
     return _merged(document, document.pop("variants", {}).get(name, {}))
+
+
+def _profiles(document: Mapping[str, Any]) -> list[Profile]:
+    """The profiles that a recipe has."""
+    return [each for each in PROFILES if each == "paper" or each in document.get("profiles", {})]
 
 
 def _profile(document: Mapping[str, Any], profile: Profile) -> dict[str, Any]:

@@ -14,11 +14,11 @@ from tcmrl_data.environment import Environment
 from tcmrl_data.errors import TcmrlError
 from tcmrl_data.layout import DECODED_FLOOR, DECODED_RATIO
 from tcmrl_data.manifest import Manifest, PartRecord
+from tcmrl_data.part import roll_out_part
 from tcmrl_data.provenance import provenance
 from tcmrl_data.snapshot import read_snapshot
 from tcmrl_data.store import pack, read_arrays
 from tcmrl_data.tasks import Task
-from tcmrl_data.unit import UnitSpec, roll_out_part
 
 FIRST_STEPS = 5
 STEP_TOLERANCE = 1e-3
@@ -63,7 +63,7 @@ def replay_part(folder: Path, record: PartRecord, manifest: Manifest) -> Replay:
     try:
         _check_cost(record, manifest)
         environment = manifest.recipe.make_environment()
-        here = provenance(environment)
+        here = provenance(environment, {})
         exact = all(record.provenance.get(key) == here[key] for key in ("cpu", "packages", "physics"))
         made = _make_again(folder, record, manifest, environment)
         stored = read_arrays(folder, identity.arrays)
@@ -91,13 +91,21 @@ def _make_again(
     task = next(
         Task(each.index, each.split, each.parameters) for each in manifest.tasks if each.index == index
     )
-    spec = UnitSpec(folder, manifest.recipe, manifest.seed, (task,))
     snapshot = read_snapshot(folder, record.identity.step)
     with (
         _one_thread(),
         contextlib.closing(environment.lanes([task.parameters] * manifest.recipe.rollouts.lanes)) as lanes,
     ):
-        return pack(roll_out_part(spec, environment, task, snapshot, lanes))
+        return pack(
+            roll_out_part(
+                manifest.recipe,
+                manifest.seed,
+                environment=environment,
+                task=task,
+                snapshot=snapshot,
+                lanes=lanes,
+            )
+        )
 
 
 @contextlib.contextmanager

@@ -24,6 +24,8 @@ class Purpose(enum.IntEnum):
     EVALUATION_RESET = 9
     EVALUATION_NOISE = 10
     EVALUATION_CONTEXT = 11
+    BEHAVIOR_ACTION = 12
+    BEHAVIOR_UPDATE = 13
 
 
 def environment_key(environment: str) -> int:

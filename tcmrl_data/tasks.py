@@ -1,7 +1,8 @@
 """Tasks of an environment: indices, parameters, and the split that never moves."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
@@ -78,6 +79,15 @@ def choose_tasks(recipe: Recipe, indices: Sequence[int] | None = None) -> list[T
         if not 0 <= index < len(tasks):
             raise TaskError(f"task index {index} does not exist, the tasks are 0-{len(tasks) - 1}")
     return [tasks[index] for index in sorted(set(indices))]
+
+
+def group_tasks(tasks: Iterable[Task], group_size: int) -> list[tuple[Task, ...]]:
+    """The tasks, ascending, put together where index // group_size is equal.
+
+    A group thus depends on the recipe and on which tasks are asked for, never on the machine.
+    """
+    ordered = sorted(tasks, key=lambda task: task.index)
+    return [tuple(group) for _, group in groupby(ordered, key=lambda task: task.index // group_size)]
 
 
 def parse_indices(text: str, num_tasks: int, *, option: str = "--tasks") -> list[int]:

@@ -95,6 +95,28 @@ def test_an_episode_depends_on_seed_and_actions_only(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
+def test_one_lane_starts_anew_while_the_others_go_on(name: str) -> None:
+    environment = environment_of(name)
+    tasks, actions = parameters_of(name)[:2], actions_of(environment)
+    lanes, everywhere = environment.lanes(tasks, reward="dense"), np.ones(2, dtype=bool)
+    lanes.reset([7, 8])
+    lanes.step(np.stack([actions[0], actions[0]]), everywhere)
+    first = lanes.reset_lane(0, 9)
+    step = lanes.step(np.stack([actions[0], actions[1]]), everywhere)
+    for lane, seed, played in ((0, 9, actions[:1]), (1, 8, actions[:2])):
+        single = environment.make(tasks[lane], view="full", reward="dense")
+        start = single.reset(seed=seed)[0]
+        for action in played:
+            observation, reward, *_ = single.step(action)
+        assert np.array_equal(step.observations[lane], observation)
+        assert step.rewards[lane] == reward
+        if lane == 0:
+            assert np.array_equal(first, start)
+        single.close()
+    lanes.close()
+
+
+@pytest.mark.parametrize("name", NAMES)
 def test_tasks_and_action_change_the_episode(name: str) -> None:
     environment = environment_of(name)
     tasks, actions = parameters_of(name), actions_of(environment)

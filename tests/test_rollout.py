@@ -26,6 +26,9 @@ class Falling(Lanes):
         self.t = 0
         return np.zeros((6, 2))
 
+    def reset_lane(self, lane: int, seed: int) -> FloatArray:
+        raise AssertionError("a rollout has one episode per lane")
+
     def step(self, actions: FloatArray, active: BoolArray) -> LaneStep:
         self.t += 1
         self.stepped.append(np.flatnonzero(active).tolist())
@@ -82,7 +85,7 @@ def test_episodes_do_not_depend_on_their_neighbours(environment: Environment) ->
 def test_the_numpy_batch_equals_single_environments(environment: Environment) -> None:
     tasks = [{"goal": [0.0, 1.0], "wind": [0.02, 0.0]}, {"goal": [1.0, 0.0], "wind": [0.01, -0.03]}]
     batch = roll(environment, environment.lanes(tasks), UniformController())
-    single = roll(environment, EnvironmentLanes(environment, tasks), UniformController())
+    single = roll(environment, EnvironmentLanes(environment, tasks, "stored"), UniformController())
     for left, right in zip(batch, single, strict=True):
         assert np.array_equal(left.observations, right.observations)
         assert np.array_equal(left.rewards, right.rewards)

@@ -48,4 +48,6 @@ def test_purposes_keep_their_numbers() -> None:
         "EVALUATION_RESET": 9,
         "EVALUATION_NOISE": 10,
         "EVALUATION_CONTEXT": 11,
+        "BEHAVIOR_ACTION": 12,
+        "BEHAVIOR_UPDATE": 13,
     }

@@ -1,8 +1,9 @@
 """Behavior sources, one a file: each has NAME, a Settings class, and a Source that yields snapshots."""
 
 import abc
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from tcmrl_data.checkpoints import CheckpointFolder
 from tcmrl_data.environment import Environment, Reward, View
@@ -21,7 +22,7 @@ class BehaviorContext:
         observation: view that the policies see.
         reward: reward that the policies learn from.
         report: called with the number of environment steps done since the last call.
-        checkpoints: where the training of a task keeps its state.
+        checkpoints: where the training of given tasks keeps its state.
     """
 
     environment: Environment
@@ -30,7 +31,7 @@ class BehaviorContext:
     observation: View
     reward: Reward
     report: Callable[[int], None]
-    checkpoints: Callable[[Task], CheckpointFolder]
+    checkpoints: Callable[[Sequence[Task]], CheckpointFolder]
 
 
 class BehaviorSource(abc.ABC):
@@ -45,6 +46,19 @@ class BehaviorSource(abc.ABC):
     @abc.abstractmethod
     def training_steps(self) -> int:
         """Environment steps of behavior training per task."""
+
+    @property
+    def group_size(self) -> int:
+        """Task indices per unit: tasks whose indices give the same quotient by it are trained together."""
+        return 1
+
+    @abc.abstractmethod
+    def training_bytes(self, environment: Environment, num_tasks: int) -> int:
+        """Most memory that training `num_tasks` tasks takes, beside the process and the simulators."""
+
+    def provenance(self) -> Mapping[str, Any]:
+        """What is to be recorded with every part beside the settings; JSON."""
+        return {}
 
     @abc.abstractmethod
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:

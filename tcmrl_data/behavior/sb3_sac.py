@@ -1,6 +1,7 @@
 """One Stable-Baselines3 SAC per task: its own replay buffer, entropy coefficient and seed."""
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import TYPE_CHECKING, Any, Literal, SupportsFloat, final
 
 import gymnasium
@@ -8,6 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.behavior import BehaviorContext, BehaviorSource
 from tcmrl_data.behavior._sac_state import capture, restore
+from tcmrl_data.environment import Environment
 from tcmrl_data.seeding import Purpose, keyed_seed
 from tcmrl_data.snapshot import Snapshot, snapshot_of_sac
 from tcmrl_data.tasks import Task
@@ -75,6 +77,9 @@ class Source(BehaviorSource):
     def training_steps(self) -> int:
         return self._settings.steps
 
+    def training_bytes(self, environment: Environment, num_tasks: int) -> int:
+        return training_bytes(self._settings, environment, num_agents=1)
+
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
         for task in context.tasks:
             yield from ((task, snapshot) for snapshot in self._train(context, task))
@@ -85,7 +90,7 @@ class Source(BehaviorSource):
         SB3's `learn` called in chunks does what one call does, so neither chunks nor checkpoints change
         a result.
         """
-        settings, checkpoints = self._settings, context.checkpoints(task)
+        settings, checkpoints = self._settings, context.checkpoints([task])
         episodes = KeyedResets(context, task)
         seed = keyed_seed(context.seed, context.environment.name, task.index, Purpose.BEHAVIOR)
         model = make_model(settings, episodes, seed=seed)
@@ -106,6 +111,25 @@ class Source(BehaviorSource):
                 context.report(chunk)
             if step > steps_done:
                 yield snapshot_of_sac(model, step=step, observation=context.observation)
+
+
+def training_bytes(settings: Settings, environment: Environment, *, num_agents: int) -> int:
+    """Most memory that training some agents at once takes: replay buffers, networks, activations.
+
+    The replay buffers count three times, since a checkpoint is a copy of them and its file another.
+    """
+    observation_dim, action_dim = environment.observation_dim, environment.action_dim
+    row = 2 * observation_dim + action_dim + 3
+    replay = min(settings.buffer_size, settings.steps) * row
+    actor = _parameters(observation_dim, settings.hidden, 2 * action_dim)
+    critic = _parameters(observation_dim + action_dim, settings.hidden, 1)
+    networks = 4 * actor + 2 * 5 * critic  # with gradients and two moments; critics with targets too
+    activations = 8 * settings.batch_size * (row + sum(settings.hidden))  # both critics, forward and backward
+    return 4 * num_agents * (3 * replay + networks + activations)
+
+
+def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
+    return sum((before + 1) * after for before, after in pairwise((inputs, *hidden, outputs)))
 
 
 def make_model(settings: Settings, environment: gymnasium.Env[Any, Any], *, seed: int) -> "SAC":

@@ -6,6 +6,7 @@ from typing import final
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.behavior import BehaviorContext, BehaviorSource
+from tcmrl_data.environment import Environment
 from tcmrl_data.snapshot import ScriptedPolicy, Snapshot
 from tcmrl_data.tasks import Task
 
@@ -43,6 +44,9 @@ class Source(BehaviorSource):
 
     @property
     def training_steps(self) -> int:
+        return 0
+
+    def training_bytes(self, environment: Environment, num_tasks: int) -> int:
         return 0
 
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:

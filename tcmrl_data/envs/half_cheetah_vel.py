@@ -44,6 +44,7 @@ class HalfCheetahVel(Environment):
     Settings = HalfCheetahVelSettings
     observation_dim = 17
     action_dim = 6
+    simulator_bytes = 2 * 2**20
     settings: HalfCheetahVelSettings
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:

@@ -54,6 +54,7 @@ class MetaWorldML1(Environment):
     Settings = MetaWorldML1Settings
     observation_dim = 39
     action_dim = 4
+    simulator_bytes = 24 * 2**20
     extras: ClassVar = {"success": np.bool_}
 
     def __init__(self, settings: EnvironmentSettings) -> None:

@@ -58,8 +58,8 @@ class _PointRobot(Environment):
     ) -> "PointRobotEnv":
         return PointRobotEnv(PointRobotLanes(self, [parameters], reward))
 
-    def lanes(self, parameters: Sequence[Parameters]) -> "PointRobotLanes":
-        return PointRobotLanes(self, parameters, "stored")
+    def lanes(self, parameters: Sequence[Parameters], *, reward: Reward = "stored") -> "PointRobotLanes":
+        return PointRobotLanes(self, parameters, reward)
 
     def oracle(self, parameters: Sequence[Parameters]) -> "GreedyController":
         return GreedyController(*goals_and_winds(parameters))
@@ -139,6 +139,11 @@ class PointRobotLanes(Lanes):
         self._positions[:] = 0.0
         self._steps[:] = 0
         return self._positions.copy()
+
+    def reset_lane(self, lane: int, seed: int) -> FloatArray:
+        self._positions[lane] = 0.0
+        self._steps[lane] = 0
+        return np.zeros(2)
 
     def step(self, actions: FloatArray, active: BoolArray) -> LaneStep:
         moves = STEP_SIZE * np.asarray(actions, dtype=np.float64) + self._winds

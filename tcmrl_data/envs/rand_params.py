@@ -109,6 +109,7 @@ class HopperRandParams(_RandParams):
 
     observation_dim = 11
     action_dim = 3
+    simulator_bytes = 2 * 2**20
     shapes: ClassVar = {
         "body_mass": (5,),
         "body_inertia": (5, 3),
@@ -128,6 +129,7 @@ class WalkerRandParams(_RandParams):
 
     observation_dim = 17
     action_dim = 6
+    simulator_bytes = 2 * 2**20
     shapes: ClassVar = {
         "body_mass": (8,),
         "body_inertia": (8, 3),

@@ -1,0 +1,279 @@
+"""Groups of tasks trained in lockstep: streams, resuming, units, and what their snapshots are."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from stable_baselines3 import SAC
+
+import tcmrl_data
+from tcmrl_data import Recipe, load_recipe, open_dataset
+from tcmrl_data.behavior import BehaviorContext
+from tcmrl_data.behavior._stacked_training import GroupTraining
+from tcmrl_data.behavior.stacked_sac import Settings, Source, _make_training
+from tcmrl_data.canonical import canonical_json
+from tcmrl_data.checkpoints import CheckpointFolder
+from tcmrl_data.errors import BuildError
+from tcmrl_data.manifest import read_manifest
+from tcmrl_data.publish import CHECKPOINTS
+from tcmrl_data.snapshot import Snapshot
+from tcmrl_data.tasks import choose_tasks, group_tasks
+
+TINY = (
+    "behavior.stacked.group=4",
+    "behavior.stacked.steps=130",
+    "behavior.stacked.warmup=50",
+    "behavior.stacked.snapshots=[0,100,130]",
+    "behavior.stacked.hidden=[16,16]",
+    "behavior.stacked.batch_size=16",
+    "rollouts.episodes=4",
+    "rollouts.lanes=2",
+)
+HOPPER = (*TINY, "behavior.stacked.steps=260", "behavior.stacked.snapshots=[0,200,260]")
+TASKS = [1, 2, 3, 5]
+
+
+class Interrupted(Exception):
+    """Ends a training in the middle, as a kill would."""
+
+
+def recipe_of(name: str = "point-robot-wind", overrides: Sequence[str] = TINY) -> Recipe:
+    return load_recipe(name, profile="quick", overrides=overrides, behavior="stacked")
+
+
+def context_of(
+    recipe: Recipe, tasks: Sequence[int], folder: Path, *, seconds: float = np.inf, stop_at: float = np.inf
+) -> BehaviorContext:
+    steps = 0
+
+    def report(count: int) -> None:
+        nonlocal steps
+        steps += count
+        if steps >= stop_at * len(tasks):
+            raise Interrupted
+
+    return BehaviorContext(
+        environment=recipe.make_environment(),
+        tasks=choose_tasks(recipe, tasks),
+        seed=0,
+        observation=recipe.behavior["observation"],
+        reward=recipe.behavior["reward"],
+        report=report,
+        checkpoints=lambda _: CheckpointFolder(folder, "group", key="k", before=np.inf, seconds=seconds),
+    )
+
+
+def source_of(recipe: Recipe) -> Source:
+    return Source(settings_of(recipe))
+
+
+def settings_of(recipe: Recipe) -> Settings:
+    return Settings.model_validate_json(canonical_json(recipe.behavior["settings"]))
+
+
+def snapshots_of(recipe: Recipe, context: BehaviorContext) -> dict[tuple[int, int], Snapshot]:
+    return {(task.index, each.step): each for task, each in source_of(recipe).snapshots(context)}
+
+
+def digests(snapshots: dict[tuple[int, int], Snapshot]) -> dict[tuple[int, int], str]:
+    return {key: each.digest() for key, each in snapshots.items()}
+
+
+def ids(folder: Path) -> dict[tuple[int, int], str]:
+    return {(part.task, part.step): part.id for part in read_manifest(folder).parts}
+
+
+def test_what_a_task_draws_and_learns_does_not_depend_on_its_group(tmp_path: Path) -> None:
+    """Replay rows of the warm-up and batch positions are equal; the policies differ by rounding at most."""
+    recipe = recipe_of()
+    alone, together = (
+        _make_training(settings_of(recipe), context_of(recipe, tasks, tmp_path))
+        for tasks in ([3], [0, 2, 3, 7])
+    )
+    for training in (alone, together):
+        for _ in range(50):
+            training.advance()
+    assert torch.equal(alone._replay.rows[0, :50], together._replay.rows[2, :50])
+    (own, own_noise), (shared, noise) = alone._draw(), together._draw()
+    assert torch.equal(own.actions[0], shared.actions[2])
+    assert torch.equal(own_noise[0], noise[2])
+    for _ in range(80):
+        alone.advance()
+        together.advance()
+    ours, theirs = alone.snapshot(0).tensors, together.snapshot(2).tensors
+    for name, array in ours.items():
+        np.testing.assert_allclose(array, theirs[name], rtol=0, atol=1e-5)
+    assert not np.array_equal(ours["mean.weight"], together.snapshot(1).tensors["mean.weight"])
+
+
+@pytest.mark.parametrize(
+    ("name", "overrides", "stop_at"),
+    [
+        ("point-robot-wind", TINY, 30),
+        ("point-robot-wind", TINY, 110),
+        ("point-robot-wind", (*TINY, "behavior.stacked.buffer_size=40", "behavior.stacked.entropy=0.1"), 110),
+        ("sparse-point-robot", (*TINY, "behavior.stacked.train_frequency=2"), 110),
+        ("hopper-rand-params", HOPPER, 230),
+    ],
+)
+def test_a_resumed_training_equals_an_uninterrupted_one(
+    tmp_path: Path, name: str, overrides: tuple[str, ...], stop_at: int
+) -> None:
+    """Killed within an episode; in hopper every lane is then at another step of another episode."""
+    recipe, tasks = recipe_of(name, overrides), [0, 2, 3]
+    straight = digests(snapshots_of(recipe, context_of(recipe, tasks, tmp_path / "straight")))
+    resumed: dict[tuple[int, int], str] = {}
+    interrupted = source_of(recipe).snapshots(
+        context_of(recipe, tasks, tmp_path, seconds=0.0, stop_at=stop_at)
+    )
+    with pytest.raises(Interrupted):
+        resumed.update(((task.index, each.step), each.digest()) for task, each in interrupted)
+    context = context_of(recipe, tasks, tmp_path)
+    state = context.checkpoints(context.tasks).load()
+    assert state is not None
+    done = state.values["steps"]
+    assert 0 < done < stop_at
+    later = digests(snapshots_of(recipe, context))
+    assert set(later) == {key for key in straight if key[1] > done}
+    assert resumed | later == straight
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Four tasks in two groups, built by two workers."""
+    folder = tmp_path_factory.mktemp("stacked") / "dataset"
+    report = tcmrl_data.build_dataset(recipe_of(), folder, tasks=TASKS, workers=2)
+    assert (report.failed, report.built) == ((), len(TASKS) * 3)
+    return folder
+
+
+def test_ids_do_not_depend_on_workers(dataset: Path, tmp_path: Path) -> None:
+    """Nor on when each group was built."""
+    for half in ([5], [1, 2, 3]):
+        tcmrl_data.build_dataset(recipe_of(), tmp_path / "halves", tasks=half, workers=1)
+    assert ids(tmp_path / "halves") == ids(dataset)
+    assert not list((dataset / CHECKPOINTS).glob("*"))
+    assert open_dataset(dataset).manifest.complete
+
+
+def test_a_group_trains_its_done_tasks_again_and_leaves_their_parts_alone(
+    dataset: Path, tmp_path: Path
+) -> None:
+    tcmrl_data.build_dataset(recipe_of(), tmp_path / "grown", tasks=[1, 2], workers=1)
+    before = ids(tmp_path / "grown")
+    report = tcmrl_data.build_dataset(recipe_of(), tmp_path / "grown", tasks=[3], workers=1)
+    assert (report.failed, report.built, report.present) == ((), 3, 6)
+    after = ids(tmp_path / "grown")
+    assert {key: after[key] for key in before} == before
+    assert {key: part for key, part in ids(dataset).items() if key[0] == 3} == {
+        key: part for key, part in after.items() if key[0] == 3
+    }
+
+
+def test_groups_are_a_function_of_indices() -> None:
+    tasks = choose_tasks(recipe_of(), TASKS)
+    groups = group_tasks(reversed(tasks), 4)
+    assert [[task.index for task in group] for group in groups] == [[1, 2, 3], [5]]
+    assert [len(group) for group in group_tasks(tasks, 1)] == [1] * 4
+
+
+def test_a_snapshot_acts_exactly_like_an_sb3_actor_with_its_weights(dataset: Path) -> None:
+    stacked = open_dataset(dataset)
+    snapshot = stacked.snapshot(2, 130)
+    model = SAC(
+        "MlpPolicy",
+        stacked.environment.make(stacked.task(2).parameters),
+        policy_kwargs={"net_arch": [16, 16]},
+        device="cpu",
+    )
+    names = {"hidden.0": "latent_pi.0", "hidden.1": "latent_pi.2", "mean": "mu", "log_std": "log_std"}
+    weights = {
+        f"{names[name.rpartition('.')[0]]}.{name.rpartition('.')[2]}": torch.tensor(array)
+        for name, array in snapshot.tensors.items()
+    }
+    model.policy.actor.load_state_dict(weights)
+    observations = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
+    expected, _ = model.predict(observations, deterministic=True)
+    controller = snapshot.controller(stacked.environment, [])
+    assert np.array_equal(controller.act(observations, np.zeros((50, 2), np.float32)), expected)
+
+
+def test_agents_learn(tmp_path: Path) -> None:
+    """On point-robot-wind, 1,200 steps bring every agent of a group most of the way to the goal."""
+    overrides = (
+        "behavior.stacked.steps=1200",
+        "behavior.stacked.warmup=200",
+        "behavior.stacked.snapshots=[0,1200]",
+        "behavior.stacked.hidden=[32,32]",
+        "behavior.stacked.batch_size=64",
+        "behavior.stacked.learning_rate=3e-3",
+        "behavior.stacked.tau=0.02",
+    )
+    recipe = recipe_of(overrides=overrides)
+    snapshots = snapshots_of(recipe, context_of(recipe, [0, 1, 2, 3], tmp_path))
+    environment = recipe.make_environment()
+    rows = []
+    for task in choose_tasks(recipe, [0, 1, 2, 3]):
+        distances = []
+        for step in (0, 1200):
+            env = environment.make(task.parameters)
+            controller = snapshots[task.index, step].controller(environment, [task.parameters])
+            observation, ended = env.reset(seed=0)[0], False
+            while not ended:
+                action = controller.act(observation[None], np.zeros((1, 2), np.float32))[0]
+                observation, _, _, ended, _ = env.step(action)
+            distances.append(np.linalg.norm(observation - [1.0, 0.0]))
+        rows.append(distances)
+    before, after = np.transpose(rows)
+    assert (after < before).all()
+    assert after.mean() < 0.4 * before.mean()
+
+
+@pytest.fixture
+def poisoned(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second agent of every group loses a weight at step 110."""
+    advance = GroupTraining.advance
+
+    def poisoned_advance(self: GroupTraining) -> None:
+        advance(self)
+        if self.steps == 110:
+            self.learner.actors.layers[0].weight[1, 0, 0] = torch.nan
+
+    monkeypatch.setattr(GroupTraining, "advance", poisoned_advance)
+
+
+@pytest.mark.usefixtures("poisoned")
+def test_a_diverged_agent_is_named_and_the_others_are_kept(tmp_path: Path) -> None:
+    recipe = recipe_of()
+    found: dict[tuple[int, int], Snapshot] = {}
+    context = context_of(recipe, [1, 2, 3], tmp_path)
+    pairs = (((task.index, each.step), each) for task, each in source_of(recipe).snapshots(context))
+    with pytest.raises(BuildError, match=r"diverged: task 2 by step 130; use a smaller"):
+        found.update(pairs)
+    assert set(found) == {(1, 0), (2, 0), (3, 0), (1, 100), (2, 100), (3, 100), (1, 130), (3, 130)}
+
+
+@pytest.mark.usefixtures("poisoned")
+def test_a_diverged_agent_reaches_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    recipe = recipe_of()
+    ill = _make_training(settings_of(recipe), context_of(recipe, [1, 2, 3], tmp_path))
+    for _ in range(130):
+        ill.advance()
+    monkeypatch.undo()
+    healthy = _make_training(settings_of(recipe), context_of(recipe, [1, 2, 3], tmp_path))
+    for _ in range(130):
+        healthy.advance()
+    assert [ill.snapshot(agent).digest() == healthy.snapshot(agent).digest() for agent in range(3)] == [
+        True,
+        False,
+        True,
+    ]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_a_missing_device_is_refused(tmp_path: Path) -> None:
+    recipe = recipe_of(overrides=(*TINY, "behavior.stacked.device=cuda"))
+    with pytest.raises(BuildError, match="finds no CUDA device; use 'cpu'"):
+        snapshots_of(recipe, context_of(recipe, [1], tmp_path))
