@@ -49,7 +49,9 @@ tcmrl.add_command(report)
 
 @tcmrl.command()
 @click.argument("manifest", metavar="MANIFEST", type=click.Path(path_type=Path))
-@click.option("--algo", metavar="NAME", help="tcmrl, or its control no_context; the recipe's if left out.")
+@click.option(
+    "--algo", metavar="NAME", help="tcmrl, focal, or the blind no_context; the recipe's if left out."
+)
 @click.option(
     "--profile",
     type=click.Choice(get_args(Profile)),

@@ -8,7 +8,7 @@ over real entries, so that loss weights mean the same for short and long episode
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn import functional
 
@@ -185,25 +185,21 @@ def task_contrastive_loss(
     )
 
 
-def distance_metric_loss(
-    contexts: Float[Tensor, "contexts latent"],
-    tasks: Int[Tensor, " contexts"],
-    *,
-    epsilon: float = 0.1,
-) -> Scalar:
+def distance_metric_loss(contexts: Float[Tensor, "tasks examples latent"], *, epsilon: float = 0.1) -> Scalar:
     """FOCAL's distance-metric loss (Li et al., 2021), inverse square: gathers each task's contexts.
 
     L = mean over pairs of one task of d^2 + mean over pairs of two tasks of 1 / (d^2 + epsilon), with
-    d^2 = |c_i - c_j|^2 / latent. Not in the paper; in its published code.
+    d^2 = |c_i - c_j|^2 / latent. Not in TCMRL's paper; in its published code.
 
     Args:
         contexts: several contexts of every task.
-        tasks: the task each of them belongs to.
         epsilon: bounds the repulsion (published code: 0.1).
     """
-    squares = (contexts.unsqueeze(0) - contexts.unsqueeze(1)).square().mean(dim=-1)
+    flat = contexts.flatten(0, 1)
+    squares = (flat.unsqueeze(0) - flat.unsqueeze(1)).square().mean(dim=-1)
+    tasks = torch.arange(len(contexts), device=flat.device).repeat_interleave(contexts.shape[1])
     same = tasks.unsqueeze(0) == tasks.unsqueeze(1)
-    pairs = ~torch.eye(len(tasks), dtype=torch.bool, device=tasks.device)
+    pairs = ~torch.eye(len(tasks), dtype=torch.bool, device=flat.device)
     return masked_mean(squares, same & pairs) + masked_mean(1.0 / (squares + epsilon), ~same)
 
 

@@ -112,37 +112,12 @@ class Standardizer(nn.Module):
         return ((values - self.mean) / self.scale).clamp(-LARGEST_INPUT, LARGEST_INPUT)
 
 
-@final
-class ContextEncoder(nn.Module):
-    """Eq. 1: c_t = e(s_t, a_t, r_t, s_{t+1}), in [-1, 1] per latent dimension.
-
-    Deviation: the encoder reads s_{t+1} - s_t in place of s_{t+1}; the two carry the same information,
-    and the difference keeps its scale where states move little in one step.
-    """
-
-    def __init__(
-        self,
-        observation_dim: int,
-        action_dim: int,
-        *,
-        latent: int,
-        hidden: Sequence[int],
-        generator: torch.Generator,
-    ) -> None:
-        super().__init__()
-        sizes = (2 * observation_dim + action_dim + 1, *hidden, latent)
-        self.perceptron = Perceptron(sizes, generator=generator)
-
-    def forward(
-        self,
-        observations: Float[Tensor, "*rows observation"],
-        actions: Float[Tensor, "*rows action"],
-        rewards: Float[Tensor, "*rows"],
-        changes: Float[Tensor, "*rows observation"],
-    ) -> Float[Tensor, "*rows latent"]:
-        """Representations of standardised transitions; `changes` are s_{t+1} - s_t."""
-        inputs = torch.cat([observations, actions, rewards.unsqueeze(-1), changes], dim=-1)
-        return torch.tanh(self.perceptron(inputs))
+def mean_representation(
+    representations: Float[Tensor, "lanes steps latent"], mask: Bool[Tensor, "lanes steps"]
+) -> Float[Tensor, "lanes latent"]:
+    """Eq. 2: c_mean = mean(c_1, ..., c_T) over each lane's real steps; FOCAL's context."""
+    real = mask.unsqueeze(-1)
+    return torch.where(real, representations, 0.0).sum(dim=1) / real.sum(dim=1)
 
 
 @dataclass(frozen=True)
@@ -185,78 +160,56 @@ class TaskExtractor(nn.Module):
 
         c_mean = mean(c_1, ..., c_T); score_t = q(c_t, c_mean); w = softmax(score); c = sum_t w_t c_t.
         """
-        real = mask.unsqueeze(-1)
-        total = torch.where(real, representations, 0.0).sum(dim=1, keepdim=True)
-        mean = total / real.sum(dim=1, keepdim=True)
+        mean = mean_representation(representations, mask).unsqueeze(1)
         inputs = torch.cat([representations, mean.expand_as(representations)], dim=-1)
         scores = self.perceptron(inputs).squeeze(-1)
         weights = torch.softmax(torch.where(mask, scores, -torch.inf), dim=-1)
-        context = torch.einsum("lt,ltd->ld", weights, torch.where(real, representations, 0.0))
+        context = torch.einsum("lt,ltd->ld", weights, torch.where(mask.unsqueeze(-1), representations, 0.0))
         return Attention(representations, scores, weights, context, mask)
 
 
-@final
-class TransitionRewardEstimator(nn.Module):
-    """r_hat(s, a, c) for one transition (dense rewards: Eq. 7 and 8)."""
-
-    def __init__(
-        self,
-        observation_dim: int,
-        action_dim: int,
-        *,
-        latent: int,
-        hidden: Sequence[int],
-        generator: torch.Generator,
-    ) -> None:
-        super().__init__()
-        self.perceptron = Perceptron((observation_dim + action_dim + latent, *hidden, 1), generator=generator)
-
-    def forward(
-        self,
-        observations: Float[Tensor, "tasks trajectories steps observation"],
-        actions: Float[Tensor, "tasks trajectories steps action"],
-        mask: Bool[Tensor, "tasks trajectories steps"],
-        context: Float[Tensor, "tasks latent"],
-    ) -> Float[Tensor, "tasks trajectories steps"]:
-        """Reward of every step under its task's context; values on padding mean nothing."""
-        shape = (*observations.shape[:-1], context.shape[-1])
-        spread = context[:, None, None].expand(shape)
-        values: Tensor = self.perceptron(torch.cat([observations, actions, spread], dim=-1))
-        return values.squeeze(-1)
+def uniform_attention(
+    representations: Float[Tensor, "lanes steps latent"], mask: Bool[Tensor, "lanes steps"]
+) -> Attention:
+    """What remains of Eq. 2-5 without an extractor: equal weights, and with them the mean of Eq. 2."""
+    weights = mask / mask.sum(dim=1, keepdim=True)
+    context = mean_representation(representations, mask)
+    return Attention(representations, torch.zeros_like(weights), weights, context, mask)
 
 
 @final
-class TrajectoryRewardEstimator(nn.Module):
-    """r_hat(s_1, a_1, ..., s_T, a_T, c): the return of a whole trajectory (sparse rewards: Eq. 17 and 18).
+class RewardEstimator(nn.Module):
+    """r_hat(s, a, c), the reward of a transition, or r_hat(s_1, a_1, ..., c), the return of a trajectory.
 
-    Steps are laid side by side up to the horizon; steps an episode does not have are zeros.
+    Args:
+        inputs: width of what is estimated on: a transition's state and action (Eq. 7 and 8), or those of a
+            whole trajectory `side_by_side` (Eq. 17 and 18).
+        latent: size of the context.
+        hidden: widths of the layers.
+        generator: draws the start.
     """
 
     def __init__(
-        self,
-        observation_dim: int,
-        action_dim: int,
-        *,
-        latent: int,
-        horizon: int,
-        hidden: Sequence[int],
-        generator: torch.Generator,
+        self, inputs: int, *, latent: int, hidden: Sequence[int], generator: torch.Generator
     ) -> None:
         super().__init__()
-        self.horizon = horizon
-        inputs = horizon * (observation_dim + action_dim) + latent
-        self.perceptron = Perceptron((inputs, *hidden, 1), generator=generator)
+        self.perceptron = Perceptron((inputs + latent, *hidden, 1), generator=generator)
 
     def forward(
-        self,
-        observations: Float[Tensor, "tasks trajectories steps observation"],
-        actions: Float[Tensor, "tasks trajectories steps action"],
-        mask: Bool[Tensor, "tasks trajectories steps"],
-        context: Float[Tensor, "tasks latent"],
-    ) -> Float[Tensor, "tasks trajectories"]:
-        """Return of every trajectory under its task's context."""
-        steps = torch.where(mask.unsqueeze(-1), torch.cat([observations, actions], dim=-1), 0.0)
-        steps = functional.pad(steps, (0, 0, 0, self.horizon - steps.shape[2])).flatten(2)
-        spread = context.unsqueeze(1).expand(*steps.shape[:2], -1)
-        values: Tensor = self.perceptron(torch.cat([steps, spread], dim=-1))
+        self, inputs: Float[Tensor, "tasks rows inputs"], context: Float[Tensor, "tasks latent"]
+    ) -> Float[Tensor, "tasks rows"]:
+        """One estimate per row, under its task's context."""
+        spread = context.unsqueeze(1).expand(-1, inputs.shape[1], -1)
+        values: Tensor = self.perceptron(torch.cat([inputs, spread], dim=-1))
         return values.squeeze(-1)
+
+
+def side_by_side(
+    steps: Float[Tensor, "tasks trajectories steps inputs"],
+    mask: Bool[Tensor, "tasks trajectories steps"],
+    *,
+    horizon: int,
+) -> Float[Tensor, "tasks trajectories all_inputs"]:
+    """The steps of a trajectory as one vector; steps that an episode does not have are zeros."""
+    real = torch.where(mask.unsqueeze(-1), steps, 0.0)
+    return functional.pad(real, (0, 0, 0, horizon - steps.shape[2])).flatten(2)

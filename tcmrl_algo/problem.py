@@ -20,6 +20,7 @@ from tcmrl_data import (
     Moments,
     Purpose,
     Trajectory,
+    UniformController,
     keyed_seed,
 )
 
@@ -63,9 +64,12 @@ class Problem:
     steps: int
     device: torch.device
 
-    def generator(self, step: int) -> torch.Generator:
-        """The CPU generator of one training step (0: the networks' starts), a function of seed and step."""
-        seed = keyed_seed(self.seed, self.environment, NO_TASK, Purpose.LEARNER, step)
+    def generator(self, step: int, stream: int = 0) -> torch.Generator:
+        """The CPU generator of one training step (0: the networks' starts), a function of seed and step.
+
+        Parts of a method draw from streams of their own, so that a switch in one changes no other's draws.
+        """
+        seed = keyed_seed(self.seed, self.environment, NO_TASK, Purpose.LEARNER, step, stream)
         return torch.Generator().manual_seed(seed)
 
 
@@ -135,6 +139,14 @@ class Algorithm(abc.ABC):
     @abc.abstractmethod
     def adapt(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         """A controller without exploration; lane i is adapted to the task that `trajectories[i]` show."""
+
+    def explore(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
+        """Acts in the first stage of the protocol `paper`; uniformly, unless a method collects otherwise.
+
+        Args:
+            trajectories: what lane i has collected so far; nothing at first.
+        """
+        return UniformController()
 
     @abc.abstractmethod
     def tensors(self) -> dict[str, Tensor]:

@@ -15,7 +15,6 @@ from tcmrl_data import (
     Purpose,
     Task,
     Trajectory,
-    UniformController,
     keyed_generator,
     keyed_seed,
     roll_out,
@@ -88,9 +87,11 @@ class Arena:
             found += self._run(tasks[lanes], controller, episode=episode, first_lane=start)
         return found
 
-    def uniform(self, tasks: Sequence[Task], *, episode: int) -> list[Trajectory]:
-        """One episode per lane of uniform actions."""
-        return self._run(tasks, UniformController(), episode=episode, first_lane=0)
+    def explored(
+        self, tasks: Sequence[Task], collected: Sequence[Context], *, episode: int
+    ) -> list[Trajectory]:
+        """One episode per lane by the method's exploration, uniform actions unless it has its own."""
+        return self._run(tasks, self._algorithm.explore(collected), episode=episode, first_lane=0)
 
     def stored(self, task: Task, *, draw: int) -> Context:
         """Stored trajectories of a task, `offline_trajectories` of them, drawn without replacement."""
@@ -146,7 +147,7 @@ def adapt_paper(arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
     collected: list[list[Trajectory]] = [[] for _ in tasks]
     for episode in range(settings.episodes):
         if episode < num_random:
-            trajectories = arena.uniform(tasks, episode=episode)
+            trajectories = arena.explored(tasks, collected, episode=episode)
         else:
             trajectories = arena.adapted(tasks, collected, episode=episode)
         for lane, trajectory in zip(collected, trajectories, strict=True):

@@ -66,6 +66,12 @@ class Controller(abc.ABC):
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         """Actions (lanes, action_dim) for observations (lanes, observation_dim) and this step's noise."""
 
+    def observe(self, rewards: FloatArray, active: BoolArray) -> None:
+        """Told after every step what it paid, (lanes,), and which lanes took it; does nothing by itself.
+
+        For controllers that adapt within an episode; the state after the step comes with the next `act`.
+        """
+
 
 @final
 class UniformController(Controller):

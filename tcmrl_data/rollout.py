@@ -50,6 +50,7 @@ def roll_out(
         seen = full if controller.view == "full" else stored
         chosen = np.clip(controller.act(seen, draws[:, t]), -1.0, 1.0).astype(np.float32)
         step = lanes.step(chosen, active)
+        controller.observe(step.rewards, active)
         full, stored = step.observations, environment.stored_view(step.observations)
         actions[:, t], rewards[:, t], observations[:, t + 1] = chosen, step.rewards, stored
         terminated[:, t], truncated[:, t] = step.terminated, step.truncated

@@ -57,8 +57,8 @@ DIFFERENTIABLE: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
         (random(2, 1, 3, 4), random(4, 4, seed=1)),
     ),
     "distance_metric": (
-        lambda c: losses.distance_metric_loss(c, torch.tensor([0, 0, 1])),
-        (random(3, 4),),
+        lambda c: losses.distance_metric_loss(c),
+        (random(2, 2, 4),),
     ),
     "orthogonality": (losses.orthogonality_loss, (random(2, 3),)),
     "q": (
@@ -204,9 +204,9 @@ def test_contrastive_loss_of_episodes_shorter_than_a_window_is_zero() -> None:
 
 
 def test_distance_metric_by_hand() -> None:
-    contexts = torch.tensor([[0.0, 0.0], [2.0, 0.0], [0.0, 4.0]])
-    loss = losses.distance_metric_loss(contexts, torch.tensor([0, 0, 1]), epsilon=0.5)
-    expected = 2.0 + (1 / 8.5 + 1 / 10.5) / 2  # d^2 is 4/2 within; 16/2 and 20/2 between
+    contexts = torch.tensor([[[0.0, 0.0], [2.0, 0.0]], [[0.0, 4.0], [0.0, 4.0]]])
+    loss = losses.distance_metric_loss(contexts, epsilon=0.5)
+    expected = (2.0 + 0.0) / 2 + (1 / 8.5 + 1 / 10.5) / 2  # d^2: 4/2 and 0 within; 16/2 and 20/2 between
     assert loss.item() == pytest.approx(expected, rel=1e-6)
 
 

@@ -1,23 +1,26 @@
 """Networks: attention, masks, frozen calls, starts, and the squashed policy."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from tcmrl_algo.encoding import ContextEncoder
 from tcmrl_algo.networks import (
     LARGEST_INPUT,
-    ContextEncoder,
     Perceptron,
     PerceptronEnsemble,
+    RewardEstimator,
     Standardizer,
     TaskExtractor,
-    TrajectoryRewardEstimator,
-    TransitionRewardEstimator,
     call_frozen,
+    side_by_side,
+    uniform_attention,
 )
 from tcmrl_algo.policy import GaussianPolicy
+from tests.made_up import problem, steps
 
 
 def generator(seed: int = 0) -> torch.Generator:
@@ -70,40 +73,30 @@ def test_order_of_transitions_changes_no_context() -> None:
     torch.testing.assert_close(first.weights[:, order], second.weights)
 
 
-def test_encoder_reads_every_part_of_a_transition() -> None:
-    encoder = ContextEncoder(3, 2, latent=5, hidden=(16,), generator=generator())
-    inputs = [random(6, 3), random(6, 2), random(6), random(6, 3, seed=2)]
-    start = encoder(*inputs)
-    assert start.shape == (6, 5)
-    assert start.abs().max() < 1
-    for place in range(4):
-        changed = [each + (1.0 if index == place else 0.0) for index, each in enumerate(inputs)]
-        assert not torch.allclose(encoder(*changed), start)
+def test_estimator_gives_each_task_its_own_context() -> None:
+    estimator = RewardEstimator(5, latent=4, hidden=(16,), generator=generator())
+    inputs, context = random(2, 6, 5), random(2, 4)
+    together = estimator(inputs, context)
+    assert together.shape == (2, 6)
+    torch.testing.assert_close(together[1:], estimator(inputs[1:], context[1:]))
+    assert not torch.allclose(estimator(inputs, context.flip(0)), together)
 
 
-def test_transition_estimator_gives_each_task_its_own_context() -> None:
-    estimator = TransitionRewardEstimator(3, 2, latent=4, hidden=(16,), generator=generator())
-    observations, actions, context = random(2, 1, 5, 3), random(2, 1, 5, 2), random(2, 4)
-    mask = torch.ones(2, 1, 5, dtype=torch.bool)
-    together = estimator(observations, actions, mask, context)
-    alone = estimator(observations[1:], actions[1:], mask[1:], context[1:])
-    torch.testing.assert_close(together[1:], alone)
-    swapped = estimator(observations, actions, mask, context.flip(0))
-    assert not torch.allclose(swapped, together)
+def test_steps_side_by_side_ignore_padding_and_its_length() -> None:
+    steps, mask = random(2, 1, 5, 3), torch.tensor([[[True] * 5], [[True] * 3 + [False] * 2]])
+    laid = side_by_side(steps, mask, horizon=7)
+    assert laid.shape == (2, 1, 21)
+    torch.testing.assert_close(laid[1, 0, :9], steps[1, 0, :3].flatten())
+    assert not laid[1, 0, 9:].any()
+    torch.testing.assert_close(side_by_side(steps[1:, :, :3], mask[1:, :, :3], horizon=7), laid[1:])
 
 
-def test_trajectory_estimator_ignores_padding_and_its_length() -> None:
-    estimator = TrajectoryRewardEstimator(3, 2, latent=4, horizon=7, hidden=(16,), generator=generator())
-    observations, actions, context = random(2, 1, 5, 3), random(2, 1, 5, 2), random(2, 4)
-    mask = torch.tensor([[[True] * 5], [[True] * 3 + [False] * 2]])
-    returns = estimator(observations, actions, mask, context)
-    assert returns.shape == (2, 1)
-    changed = torch.where(mask.unsqueeze(-1), observations, 9.0)
-    torch.testing.assert_close(estimator(changed, actions, mask, context), returns)
-    short = estimator(observations[1:, :, :3], actions[1:, :, :3], mask[1:, :, :3], context[1:])
-    torch.testing.assert_close(short, returns[1:])
-    moved = estimator(observations + 1.0, actions, mask, context)
-    assert not torch.allclose(moved, returns)
+def test_uniform_attention_is_the_mean_of_real_steps() -> None:
+    representations = random(2, 4, 3)
+    found = uniform_attention(representations, MASK)
+    torch.testing.assert_close(found.weights[0], torch.tensor([1 / 3, 1 / 3, 1 / 3, 0.0]))
+    torch.testing.assert_close(found.context[0], representations[0, :3].mean(dim=0))
+    torch.testing.assert_close(found.context[1], representations[1, 0])
 
 
 def test_frozen_call_passes_gradients_to_inputs_alone() -> None:
@@ -176,3 +169,31 @@ def test_log_probability_is_finite_far_out() -> None:
     sample = policy.sample(torch.full((2, 1), 0.0), torch.tensor([[60.0], [-60.0]]))
     assert torch.isfinite(sample.log_probabilities).all()
     assert math.isclose(sample.actions.abs().max().item(), 1.0)
+
+
+def test_encoder_reads_every_part_of_a_transition() -> None:
+    encoder = ContextEncoder(problem(), latent=5, hidden=(16,), generator=generator())
+    values = steps(2, 1, 3, seed=1)
+    (start,) = encoder(encoder.read(values))
+    assert start.shape == (2, 1, 3, 5)
+    assert start.abs().max() < 1
+    for name in ("observations", "actions", "rewards", "next_observations"):
+        (moved,) = encoder(encoder.read(replace(values, **{name: getattr(values, name) + 1.0})))
+        assert not torch.allclose(moved, start), name
+
+
+def test_encoder_reads_standardised_differences() -> None:
+    encoder = ContextEncoder(problem(), latent=5, hidden=(), generator=generator())
+    values = steps(2, 1, 3, seed=1)
+    read = encoder.read(values)
+    torch.testing.assert_close(read.state_actions, torch.cat([values.observations, values.actions], dim=-1))
+    torch.testing.assert_close(read.rewards, values.rewards)
+    change = values.next_observations - values.observations  # of standard deviation 0.5
+    torch.testing.assert_close(read.inputs[..., 6:], (2 * change).clamp(-LARGEST_INPUT, LARGEST_INPUT))
+
+
+def test_groups_of_transitions_are_encoded_as_each_alone() -> None:
+    encoder = ContextEncoder(problem(), latent=5, hidden=(16,), generator=generator())
+    groups = [encoder.read(steps(*shape, seed=1)) for shape in ((2, 3, 4), (2, 1, 4), (2, 5, 2))]
+    for group, found in zip(groups, encoder(*groups), strict=True):
+        torch.testing.assert_close(found, encoder(group)[0])

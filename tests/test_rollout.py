@@ -41,14 +41,19 @@ class Falling(Lanes):
 
 
 class Recording(Controller):
-    """Asks for an action out of bounds and remembers how many lanes it saw."""
+    """Asks for an action out of bounds and remembers how many lanes it saw, and what each step paid."""
 
     def __init__(self) -> None:
         self.seen: list[int] = []
+        self.paid: list[float] = []
 
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         self.seen.append(len(observations))
         return np.full((len(observations), 2), 3.0)
+
+    def observe(self, rewards: FloatArray, active: BoolArray) -> None:
+        assert rewards[~active].sum() == 0
+        self.paid.append(float(rewards.sum()))
 
 
 @pytest.fixture
@@ -61,6 +66,7 @@ def test_episodes_end_where_they_end(environment: Environment) -> None:
     episodes = roll(environment, lanes, controller)
     assert [len(each) for each in episodes] == [1, 2, 3, 4, 4, 4]
     assert [bool(each.terminated[-1]) for each in episodes] == [True] * 4 + [False] * 2
+    assert controller.paid == [6.0, 5.0, 4.0, 3.0]  # a controller may adapt within an episode
     assert [bool(each.truncated[-1]) for each in episodes] == [False] * 4 + [True] * 2
     assert [each.observations[-1, 0] for each in episodes] == [1, 2, 3, 4, 4, 4]
     assert [each.undiscounted_return for each in episodes] == [1, 2, 3, 4, 4, 4]

@@ -13,9 +13,10 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_algo
 from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
-from tcmrl_algo.config import TrainingSettings
+from tcmrl_algo.config import ALGORITHMS, TrainingSettings
 from tcmrl_algo.train import Progress
 from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
+from tcmrl_data.discovery import modules
 from tests.commands import Call, assert_refused, in_process
 
 SMALL = (
@@ -102,7 +103,7 @@ def test_unknown_algorithm_names_the_nearest(tiny: Dataset) -> None:
         config_of(tiny, algorithm="tcmlr")
 
 
-@pytest.mark.parametrize("algorithm", ["tcmrl", "no_context"])
+@pytest.mark.parametrize("algorithm", [module.NAME for module in modules(ALGORITHMS)])
 def test_one_seed_gives_the_same_parameters_after_100_steps(start: Train, algorithm: str) -> None:
     first = start("first", algorithm=algorithm, steps=100, seed=3)
     torch.manual_seed(12345)  # the global state plays no part

@@ -6,7 +6,6 @@ so that a blind critic believes every goal to pay well, and the policy leaves fo
 With rewards averaged over the training tasks the same training ends at the best fixed target.
 """
 
-from collections.abc import Mapping, Sequence
 from typing import final
 
 import torch
@@ -14,11 +13,10 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
-from tcmrl_algo.actor_critic import ActorCritic
 from tcmrl_algo.config import TrainingSettings
-from tcmrl_algo.context_algorithm import ContextAlgorithm
-from tcmrl_algo.problem import Algorithm, Metrics, Problem, TrainedModules
-from tcmrl_data import Batch, BatchSizes, Trajectory
+from tcmrl_algo.context_algorithm import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.problem import Algorithm, Problem
+from tcmrl_data import Batch, BatchSizes, Steps
 
 NAME = "no_context"
 
@@ -37,43 +35,18 @@ def batch_sizes(settings: TrainingSettings) -> BatchSizes:
 
 def create(problem: Problem, settings: TrainingSettings, config: Config) -> Algorithm:
     """A new learner, its networks at their start."""
-    return NoContext(problem, settings)
+    return ContextAlgorithm(problem, settings, learner=Blind())
 
 
 @final
-class NoContext(ContextAlgorithm):
-    """An actor-critic under a context of no dimensions."""
+class Blind(ContextLearner):
+    """A context of no dimensions."""
 
-    def __init__(self, problem: Problem, settings: TrainingSettings) -> None:
-        self._problem = problem
-        self.actor_critic = ActorCritic(
-            settings.actor_critic, problem, latent=0, generator=problem.generator(0)
-        ).to(problem.device)
-        self._adam = settings.optimizer.build(self.actor_critic, decay_steps=problem.steps)
-        self._trained = TrainedModules(
-            {"all": self.actor_critic}, {"all": self._adam, **self.actor_critic.optimizers()}
-        )
+    latent = 0
 
-    def update(self, batch: Batch, step: int) -> Metrics:
-        generator = self._problem.generator(step)
-        nothing = batch.transitions.rewards.new_zeros(len(batch.task_indices), 0)
-        rows = self.actor_critic.rows(batch.transitions, nothing)
-        self.actor_critic.train_dual(rows, generator)
-        loss, metrics = self.actor_critic.losses(rows, generator)
-        self._adam.step(loss, steps_done=step - 1)
-        self.actor_critic.after_step()
-        return {name: each.detach() for name, each in metrics.items()}
+    def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
+        rewards = batch.transitions.rewards
+        return ContextLosses(rewards.new_zeros(()), rewards.new_zeros(len(rewards), 0), {})
 
-    def context(self, trajectories: Sequence[Sequence[Trajectory]]) -> Float[Tensor, "lanes latent"]:
-        return torch.zeros(len(trajectories), 0, device=self._problem.device)
-
-    def policy(
-        self, observations: Float[Tensor, "lanes observation"], context: Float[Tensor, "lanes latent"]
-    ) -> Float[Tensor, "lanes action"]:
-        return self.actor_critic.act(observations, context)
-
-    def tensors(self) -> dict[str, Tensor]:
-        return self._trained.tensors()
-
-    def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
-        self._trained.load_tensors(tensors)
+    def context(self, steps: Steps) -> Float[Tensor, "lanes latent"]:
+        return steps.rewards.new_zeros(len(steps.rewards), 0)

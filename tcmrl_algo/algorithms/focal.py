@@ -1,0 +1,75 @@
+"""FOCAL (Li et al., 2021): the mean of transition representations as context, trained by distances alone."""
+
+from typing import final
+
+import torch
+from jaxtyping import Float
+from pydantic import BaseModel, ConfigDict, Field
+from torch import Tensor
+
+from tcmrl_algo import losses
+from tcmrl_algo.config import TrainingSettings
+from tcmrl_algo.context_algorithm import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.encoding import ContextEncoder
+from tcmrl_algo.networks import mean_representation
+from tcmrl_algo.problem import Algorithm, Problem
+from tcmrl_data import Batch, BatchSizes, Steps
+
+NAME = "focal"
+
+
+class Config(BaseModel):
+    """The `[training.focal]` table. No weight: one loss alone trains the encoder, and Adam has no scale.
+
+    Attributes:
+        latent: size of representations and contexts (published code of TCMRL: 20).
+        encoder_hidden: widths of the context encoder (published code: 200 x 3).
+        epsilon: bounds the repulsion of two tasks' contexts (published code: 0.1).
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    latent: int = Field(default=20, ge=1)
+    encoder_hidden: tuple[int, ...] = (200, 200, 200)
+    epsilon: float = Field(default=0.1, gt=0)
+
+
+def batch_sizes(settings: TrainingSettings) -> BatchSizes:
+    """The `[training.batch]` table without windows."""
+    return settings.batch.model_copy(update={"windows": 0})
+
+
+def create(problem: Problem, settings: TrainingSettings, config: Config) -> Algorithm:
+    """A new learner, its networks at their start."""
+    learner = FocalLearner(problem, config, generator=problem.generator(0))
+    return ContextAlgorithm(problem, settings, learner=learner)
+
+
+@final
+class FocalLearner(ContextLearner):
+    """Encoder and mean."""
+
+    def __init__(self, problem: Problem, config: Config, *, generator: torch.Generator) -> None:
+        super().__init__()
+        self.latent, self._epsilon = config.latent, config.epsilon
+        self.encoder = ContextEncoder(
+            problem, latent=config.latent, hidden=config.encoder_hidden, generator=generator
+        )
+
+    def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
+        """The distances of single trajectories' contexts, execution trajectories among them."""
+        groups = [self.encoder.read(batch.context), self.encoder.read(batch.execution)]
+        representations = torch.cat(self.encoder(*groups), dim=1)
+        mask = torch.cat([each.mask for each in groups], dim=1)
+        single = mean_representation(representations.flatten(0, 1), mask.flatten(0, 1))
+        distance = losses.distance_metric_loss(single.unflatten(0, mask.shape[:2]), epsilon=self._epsilon)
+        num_context = batch.context.mask.shape[1]
+        context = mean_representation(
+            representations[:, :num_context].flatten(1, 2), mask[:, :num_context].flatten(1, 2)
+        )
+        metrics = {"loss/distance": distance, "context/spread": context.std(dim=0).mean()}
+        return ContextLosses(distance, context, metrics)
+
+    def context(self, steps: Steps) -> Float[Tensor, "lanes latent"]:
+        (representations,) = self.encoder(self.encoder.read(steps))
+        return mean_representation(representations.flatten(1, 2), steps.mask.flatten(1, 2))

@@ -1,0 +1,75 @@
+"""The offline actor-critic: bounds, who trains whom, targets, BRAC."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from tcmrl_algo.actor_critic import ActorCritic, ActorCriticSettings, value_bounds
+from tests.made_up import TASKS, problem, steps
+
+
+def test_value_bounds_are_geometric_sums_of_the_extreme_rewards() -> None:
+    bounds = value_bounds(ActorCriticSettings(gamma=0.5, reward_scale=3.0, entropy=0.0), problem())
+    assert bounds == pytest.approx((-12.0, 6.0))  # 3 * -2 * 2 and 3 * 1 * 2
+
+
+@pytest.mark.parametrize(("clip", "same"), [(True, True), (False, False)])
+def test_next_values_beyond_the_bounds_count_as_the_bound(clip: bool, same: bool) -> None:
+    made = ActorCriticSettings(hidden=(8,), clip_targets=clip)
+    actor_critic = ActorCritic(made, problem(), latent=2, generator=torch.Generator().manual_seed(0))
+    rows = actor_critic.rows(steps(TASKS, 5, seed=1), torch.zeros(TASKS, 2))
+    found = []
+    for factor in (2.0, 3.0):
+        with torch.no_grad():
+            actor_critic.target_value.layers[-1].bias.fill_(factor * actor_critic.bounds[1] + 1e3)
+        found.append(actor_critic.losses(rows, torch.Generator().manual_seed(0))[1]["loss/critic"].item())
+    assert (found[0] == found[1]) is same
+
+
+def test_each_loss_trains_its_own_network() -> None:
+    actor_critic = ActorCritic(
+        ActorCriticSettings(hidden=(8,), mean_regularization=0.0, std_regularization=0.0),
+        problem(),
+        latent=2,
+        generator=torch.Generator().manual_seed(0),
+    )
+    rows = actor_critic.rows(steps(TASKS, 5, seed=1), torch.zeros(TASKS, 2))
+    own = {"loss/critic": "critics", "loss/value": "value", "loss/policy": "policy"}
+    for loss, network in own.items():
+        actor_critic.zero_grad()
+        _, metrics = actor_critic.losses(rows, torch.Generator().manual_seed(0))
+        metrics[loss].backward()  # type: ignore[no-untyped-call]
+        touched = {
+            name.split(".")[0]
+            for name, each in actor_critic.named_parameters()
+            if each.grad is not None and each.grad.any()
+        }
+        assert touched == {network}
+
+
+def test_target_follows_by_tau() -> None:
+    made = ActorCriticSettings(hidden=(8,), tau=0.25)
+    actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        actor_critic.value.layers[-1].bias.fill_(4.0)
+        actor_critic.target_value.layers[-1].bias.fill_(0.0)
+    actor_critic.after_step()
+    assert actor_critic.target_value.layers[-1].bias.item() == pytest.approx(1.0)
+
+
+def test_dual_critic_tells_a_far_policy_from_behavior_and_alpha_rises() -> None:
+    brac = {"mode": "policy", "alpha": 1.0, "learning_rate": 1e-2, "steps": 3, "penalty": 0.1}
+    made = ActorCriticSettings.model_validate({"hidden": (16,), "brac": brac})
+    actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
+    with torch.no_grad():  # the policy acts near (1, 1), the data near (0, 0)
+        actor_critic.policy.perceptron.layers[-1].bias.copy_(torch.tensor([3.0, 3.0, -3.0, -3.0]))
+    data = steps(TASKS, 50, seed=1)
+    rows = actor_critic.rows(replace(data, actions=data.actions * 0.1), torch.zeros(TASKS, 0))
+    for step in range(100):
+        actor_critic.train_dual(rows, torch.Generator().manual_seed(step))
+    _, metrics = actor_critic.losses(rows, torch.Generator().manual_seed(0))
+    assert metrics["actor_critic/divergence"].item() > 0.5
+    actor_critic.after_step()
+    assert actor_critic.brac is not None
+    assert actor_critic.brac.alpha.item() > 1.0
