@@ -162,7 +162,8 @@ def read_experiment(tables: Mapping[str, Any], *, place: str) -> Experiment:
 
 def experiment_names() -> list[str]:
     """Experiments that come with the package."""
-    return sorted(each.name.removesuffix(".toml") for each in _shipped().iterdir() if each.suffix == ".toml")
+    names = [each.name for each in _shipped().iterdir()]
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 
 def folder_name(text: str) -> str:
@@ -184,5 +185,5 @@ def override_texts(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
             yield f"{prefix}{key}={json.dumps(value)}"
 
 
-def _shipped() -> Path:
-    return Path(str(importlib.resources.files("tcmrl_manifests"))) / "experiments"
+def _shipped() -> Traversable:
+    return importlib.resources.files("tcmrl_manifests") / "experiments"

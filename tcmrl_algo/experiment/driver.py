@@ -89,8 +89,9 @@ def run_experiment(
         only: labels of methods; all where empty.
         seeds: instead of the experiment's.
         steps: training steps instead of `run.steps`.
-        workers: runs at a time, one per core where None. Each gets its share of the cores as threads; a
-            run that was begun keeps the threads that it had, on which its last bits depend.
+        workers: runs at a time, one per core where None. Each gets its share of the cores as threads,
+            whether or not there are so many runs; a run that was begun keeps the threads that it had, on
+            which its last bits depend.
         device: a torch device, for runs that are not begun yet.
         report: called as runs end.
 
@@ -101,9 +102,9 @@ def run_experiment(
         >>> experiment = load_experiment("figure5")  # doctest: +SKIP
         >>> run_experiment(experiment, "results/figure5", workers=2).results  # doctest: +SKIP
     """
-    began, out, cores = time.perf_counter(), Path(out), os.cpu_count() or 1
+    began, out, cores = time.perf_counter(), Path(out), len(os.sched_getaffinity(0))
     plan = plan_runs(experiment, data=Path(data), only=only, seeds=seeds, steps=steps)
-    workers = min(workers or cores, len(plan))
+    workers = workers or cores
     threads = max(1, cores // workers)
     found = {run.id: _finished(run, out) for run in plan}
     jobs = {

@@ -40,21 +40,20 @@ def draw_curves(file: Path, title: str, results: Sequence[RunResult], protocol: 
 
 
 def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
-    """Final returns per protocol: a bar of the mean, dots for seeds, an interval from five seeds."""
+    """Final returns per protocol: a line at the mean, dots for seeds, an interval from five seeds."""
     protocols = list(results[0].evaluations)
     figure, panels = _panels(len(protocols))
     methods = _by_method(results)
     for axes, protocol in zip(panels, protocols, strict=True):
-        lowest = min(run.evaluations[protocol]["mean_final"] for run in results)
-        for place, (method, runs) in enumerate(methods.items()):
+        for place, runs in enumerate(methods.values()):
             summary = summarize([run.evaluations[protocol]["mean_final"] for run in runs])
-            base = min(0.0, 1.05 * lowest)
-            axes.bar(place, summary.mean - base, bottom=base, color=f"C{place % 10}", alpha=0.5, label=method)
-            axes.plot([place] * len(runs), summary.values, "k.", markersize=4)
+            color = f"C{place % 10}"
+            axes.hlines(summary.mean, place - 0.3, place + 0.3, color=color, linewidth=3)
+            axes.plot([place] * len(runs), summary.values, ".", color="0.3", markersize=5)
             if summary.low is not None and summary.high is not None:
-                axes.vlines(place, summary.low, summary.high, color="k", linewidth=2)
+                axes.vlines(place, summary.low, summary.high, color=color, linewidth=8, alpha=0.3)
         axes.set_xticks(range(len(methods)), list(methods), rotation=30, ha="right", fontsize="small")
-        axes.set(title=f"{title}: {protocol}", ylabel="return on test tasks")
+        axes.set(title=f"{title}: {protocol}", ylabel="return on test tasks", xlim=(-0.6, len(methods) - 0.4))
     figure.savefig(file, dpi=130)
 
 
