@@ -16,6 +16,8 @@ from tcmrl_algo.policy import GaussianPolicy, PolicySample
 from tcmrl_algo.problem import Metrics, Problem
 from tcmrl_data import Steps
 
+LARGEST_Q = "actor_critic/largest_q"
+
 
 class BracSettings(BaseModel):
     """The `[training.actor_critic.brac]` table: behavior regularisation by a dual KL estimate (BRAC, FOCAL).
@@ -58,6 +60,8 @@ class ActorCriticSettings(BaseModel):
         log_std_range: bounds of the policy's log standard deviation (published code: [-20, 0]).
         clip_targets: hold V(s') within what the data's rewards allow (ours: critics trained on narrow data
             believe in states outside it).
+        divergence_factor: training stops where some |Q| exceeds what the data's rewards allow this many times
+            (ours; Q that diverges grows without end, so that the number hardly matters).
         brac: behavior regularisation.
     """
 
@@ -72,6 +76,7 @@ class ActorCriticSettings(BaseModel):
     std_regularization: float = Field(default=1e-3, ge=0)
     log_std_range: tuple[float, float] = (-20.0, 0.0)
     clip_targets: bool = True
+    divergence_factor: float = Field(default=100.0, gt=1)
     brac: BracSettings = BracSettings()
 
 
@@ -184,6 +189,7 @@ class ActorCritic(nn.Module):
             "loss/value": state_value_loss,
             "loss/policy": actor_loss,
             "actor_critic/q": q_values.mean(),
+            LARGEST_Q: q_values.abs().amax(),
             "actor_critic/policy_std": sample.log_std.exp().mean(),
         }
         return total, metrics
@@ -193,6 +199,10 @@ class ActorCritic(nn.Module):
             self.settings.mean_regularization * sample.mean.square().mean()
             + self.settings.std_regularization * sample.log_std.square().mean()
         )
+
+    def limits(self) -> dict[str, float]:
+        """The |Q| that tells divergence; at least the factor itself, where rewards are next to nothing."""
+        return {LARGEST_Q: self.settings.divergence_factor * max(1.0, *map(abs, self.bounds))}
 
     def optimizers(self) -> dict[str, Adam]:
         """Optimisers that this object steps itself, by name."""

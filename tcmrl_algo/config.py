@@ -23,6 +23,9 @@ class RunSettings(BaseModel):
         algorithm: a file of `tcmrl_algo/algorithms`.
         steps: training steps, and the length of all schedules.
         snapshots: which snapshots to learn from: `all`, `last`, `steps>=N` or `return>=Q`.
+        context_snapshots: which snapshots context and execution trajectories and windows come from, and
+            stored contexts in evaluation; those of `snapshots` if left out. The actor-critic's
+            transitions are always those of `snapshots`.
         threads: CPU threads of torch; results depend on it in their last bits.
         log_every: steps between two lines of metrics.
         checkpoint_every: steps between two checkpoints.
@@ -38,6 +41,7 @@ class RunSettings(BaseModel):
     algorithm: str = "tcmrl"
     steps: int = Field(default=100_000, ge=1)
     snapshots: str = "all"
+    context_snapshots: str | None = None
     threads: int = Field(default=1, ge=1)
     log_every: int = Field(default=100, ge=1)
     checkpoint_every: int = Field(default=5_000, ge=1)

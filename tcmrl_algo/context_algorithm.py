@@ -100,6 +100,9 @@ class ContextAlgorithm(Algorithm):
         self.actor_critic.after_step()
         return {name: each.detach() for name, each in (found.metrics | metrics).items()}
 
+    def limits(self) -> Mapping[str, float]:
+        return self.actor_critic.limits()
+
     def explore(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         return self.learner.explore(self.actor_critic, trajectories)
 

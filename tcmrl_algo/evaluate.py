@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -32,8 +32,8 @@ class TaskResult:
         oracle: return of a controller that knows the task, or None.
         random: return of uniform actions.
         regret: oracle - final, or None.
-        normalized: (final - random) / (best - random), best being the oracle or, without one, the best
-            behavior policy.
+        normalized: (final - random) / (best - random), best being the return of the reference.
+        reference: what `normalized` is 1 at: the `oracle` or, without one, the best `behavior` policy.
         success: share of final episodes that succeed, or None where the environment does not say.
         shuffled: mean return of the same policy under other tasks' contexts.
     """
@@ -46,6 +46,7 @@ class TaskResult:
     random: float
     regret: float | None
     normalized: float | None
+    reference: Literal["oracle", "behavior"]
     success: float | None
     shuffled: float
 
@@ -158,6 +159,7 @@ def _results(arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Adaptati
                 random=references.uniform,
                 regret=None if references.oracle is None else references.oracle - mean,
                 normalized=_share(mean, references.uniform, best),
+                reference="behavior" if references.oracle is None else "oracle",
                 success=_success(final[task.index]),
                 shuffled=_mean_return(shuffled[task.index]),
             )

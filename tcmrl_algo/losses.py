@@ -142,7 +142,9 @@ def info_nce(
         mask: which tasks exist at a position. The others are in no denominator there.
         temperature: tau.
     """
-    logits = torch.einsum("...id,...ld->...il", queries, keys) / temperature
+    # contiguous, mask included: otherwise products fall back to one small product per position
+    queries, keys, mask = queries.contiguous(), keys.contiguous(), mask.contiguous()
+    logits = queries @ keys.mT / temperature
     logits = torch.where(mask.unsqueeze(-2), logits, -torch.inf)
     present = mask & (mask.sum(dim=-1, keepdim=True) > 1)  # a lone task has nothing to be told apart from
     logits = torch.where(present.unsqueeze(-1), logits, 0.0)  # keeps rows without any key free of NaN
@@ -175,11 +177,11 @@ def task_contrastive_loss(
     if representations.shape[2] < window_length:
         return (representations * 0.0).sum() + (similarity * 0.0).sum()
     last = window_length - 1
-    windows = representations.unfold(2, window_length, 1)  # tasks trajectories positions latent K
-    priors = windows[..., :last].mean(dim=-1)
+    flat = representations[:, :, :-1].flatten(0, 1).transpose(1, 2)  # every step but the last begins a prior
+    priors = functional.avg_pool1d(flat, last, stride=1).transpose(1, 2)
     return info_nce(
-        (priors @ similarity).permute(1, 2, 0, 3),
-        windows[..., last].permute(1, 2, 0, 3),
+        (priors @ similarity).unflatten(0, representations.shape[:2]).permute(1, 2, 0, 3),
+        representations[:, :, last:].permute(1, 2, 0, 3),
         mask[:, :, last:].permute(1, 2, 0),  # padding is at the end: the last step being real suffices
         temperature=temperature,
     )

@@ -136,6 +136,10 @@ class Algorithm(abc.ABC):
     def update(self, batch: Batch, step: int) -> Metrics:
         """One training step, a function of the current tensors, the batch and the step's number (from 1)."""
 
+    def limits(self) -> Mapping[str, float]:
+        """Size beyond which a metric says that learning diverges, for some of them; training stops there."""
+        return {}
+
     @abc.abstractmethod
     def adapt(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         """A controller without exploration; lane i is adapted to the task that `trajectories[i]` show."""

@@ -96,7 +96,8 @@ class Arena:
     def stored(self, task: Task, *, draw: int) -> Context:
         """Stored trajectories of a task, `offline_trajectories` of them, drawn without replacement."""
         if task.index not in self._stored:
-            selection = self.dataset.select(tasks=[task.index], snapshots=self.settings.snapshots)
+            snapshots = self.settings.context_snapshots or self.settings.snapshots
+            selection = self.dataset.select(tasks=[task.index], snapshots=snapshots)
             self._stored[task.index] = selection.trajectories(task.index)
         stored = self._stored[task.index]
         number = min(self.settings.offline_trajectories, len(stored))

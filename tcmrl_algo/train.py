@@ -2,6 +2,8 @@
 
 import hashlib
 import importlib.metadata
+import math
+import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -10,14 +12,20 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from tcmrl_algo.batches import Batches, JoinedBatches
 from tcmrl_algo.checkpoint import Run, RunRecord, open_run, write_run
 from tcmrl_algo.config import ALGORITHMS, TrainingConfig, validated
 from tcmrl_algo.metrics import MetricsWriter
 from tcmrl_algo.problem import Algorithm, MomentsRecord, problem_of
-from tcmrl_data import BatchSizes, CheckpointError, Dataset, Sampler, TrainingError, plugin
+from tcmrl_data import BatchSizes, CheckpointError, Dataset, TrainingError, plugin
 
 PACKAGES = ("torch", "numpy")
 """Whose versions results depend on."""
+REMEDY = (
+    "the last checkpoint, if any, is intact; lower optimizer.learning_rate or bound "
+    "optimizer.gradient_norm with --set"
+)
+"""Against divergence."""
 
 
 @dataclass(frozen=True)
@@ -177,19 +185,24 @@ def digest(tensors: Mapping[str, Tensor]) -> str:
     return total.hexdigest()
 
 
-def _batches(dataset: Dataset, config: TrainingConfig, *, seed: int, device: str) -> Sampler:
+def _batches(dataset: Dataset, config: TrainingConfig, *, seed: int, device: str) -> Batches:
     """The stream of batches from the training tasks."""
     settings = config.settings
     module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
-    selection = dataset.select(split="train", snapshots=settings.run.snapshots)
     sizes: BatchSizes = module.batch_sizes(settings)
-    return selection.sampler(sizes, seed=seed, device=str(_device(device)))
+
+    place = str(_device(device))
+    transitions = dataset.select(split="train", snapshots=settings.run.snapshots)
+    if settings.run.context_snapshots is None:
+        return transitions.sampler(sizes, seed=seed, device=place)
+    contexts = dataset.select(split="train", snapshots=settings.run.context_snapshots)
+    return JoinedBatches(transitions, contexts, sizes, seed=seed, device=place)
 
 
 def _train(
     run: Run,
     algorithm: Algorithm,
-    batches: Sampler,
+    batches: Batches,
     *,
     start: int,
     report: Callable[[Progress], None],
@@ -201,7 +214,7 @@ def _train(
     with MetricsWriter(run.folder, step=start) as writer:
         for step in range(start + 1, last + 1):
             metrics = algorithm.update(batches.batch(step - 1), step)
-            _check_finite(metrics, step)
+            _check_sizes(metrics, algorithm.limits(), step)
             if step % settings.log_every == 0 or step == last:
                 values = {name: float(each) for name, each in metrics.items()}
                 now = time.perf_counter()
@@ -215,8 +228,22 @@ def _train(
     return TrainingReport(run, last, time.perf_counter() - began, digest(algorithm.tensors()))
 
 
+def _check_sizes(metrics: Mapping[str, Tensor], limits: Mapping[str, float], step: int) -> None:
+    """Stops training where a metric is NaN or beyond its limit, one synchronisation for all of them.
+
+    Raises:
+        TrainingError: with the first such metric, its value, its limit and the step.
+    """
+    largest = [limits.get(name, sys.float_info.max) for name in metrics]
+    sizes = torch.stack([each.double().abs() for each in metrics.values()]).tolist()
+    for name, size, limit in zip(metrics, sizes, largest, strict=True):
+        if math.isnan(size) or size > limit:
+            what = f"is {size:.3g}, beyond {limit:.3g}," if name in limits else "is not finite"
+            raise TrainingError(f"{name} {what} at step {step}; {REMEDY}")
+
+
 def _check_finite(values: Mapping[str, Tensor], step: int) -> None:
-    """Stops training where a quantity is NaN or infinite, one synchronisation for all of them.
+    """Stops training where a tensor holds NaN or infinity, one synchronisation for all of them.
 
     Raises:
         TrainingError: with the first such quantity and the step.
@@ -225,10 +252,7 @@ def _check_finite(values: Mapping[str, Tensor], step: int) -> None:
     if bool(torch.stack(bad).all()):
         return
     name = next(name for name, finite in zip(values, bad, strict=True) if not finite)
-    raise TrainingError(
-        f"{name} is not finite at step {step}; the last checkpoint, if any, is intact; lower "
-        "optimizer.learning_rate or bound optimizer.gradient_norm with --set"
-    )
+    raise TrainingError(f"{name} is not finite at step {step}; {REMEDY}")
 
 
 def _device(name: str) -> torch.device:

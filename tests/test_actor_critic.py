@@ -73,3 +73,22 @@ def test_dual_critic_tells_a_far_policy_from_behavior_and_alpha_rises() -> None:
     actor_critic.after_step()
     assert actor_critic.brac is not None
     assert actor_critic.brac.alpha.item() > 1.0
+
+
+def test_the_limit_of_q_is_a_multiple_of_what_rewards_allow() -> None:
+    made = ActorCriticSettings(gamma=0.5, reward_scale=3.0, entropy=0.0, divergence_factor=10.0, hidden=(8,))
+    actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator())
+    assert actor_critic.limits() == pytest.approx({"actor_critic/largest_q": 120.0})  # 10 * max(12, 6)
+    small = ActorCriticSettings(reward_scale=1e-9, entropy=0.0, divergence_factor=10.0, hidden=(8,))
+    limits = ActorCritic(small, problem(), latent=0, generator=torch.Generator()).limits()
+    assert limits == {"actor_critic/largest_q": 10.0}
+
+
+def test_the_largest_q_is_that_of_any_critic_and_row() -> None:
+    made = ActorCriticSettings(hidden=(8,))
+    actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
+    rows = actor_critic.rows(steps(TASKS, 5, seed=1), torch.zeros(TASKS, 0))
+    with torch.no_grad():
+        actor_critic.critics.members[1].layers[-1].bias.fill_(-500.0)
+    _, metrics = actor_critic.losses(rows, torch.Generator().manual_seed(0))
+    assert metrics["actor_critic/largest_q"].item() == pytest.approx(500.0, abs=5.0)

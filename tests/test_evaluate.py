@@ -133,6 +133,14 @@ def test_offline_protocol_draws_stored_trajectories_of_the_task_itself(two_tests
         assert len({tuple(each) for each in drawn}) > 1
 
 
+def test_stored_contexts_come_from_the_snapshots_of_contexts(two_tests: Dataset) -> None:
+    (task, *_) = two_tests.test_tasks
+    place = arena(two_tests, GoalReader(), context_snapshots="last", offline_trajectories=6)
+    last = two_tests.select(tasks=[task.index], snapshots="last").trajectories(task.index)
+    stored = {each.rewards.tobytes() for each in place.stored(task, draw=0)}
+    assert stored == {each.rewards.tobytes() for each in last}
+
+
 def test_idaq_protocol_tries_training_contexts_and_keeps_the_best(two_tests: Dataset) -> None:
     place = arena(two_tests, GoalReader(), episodes=5)
     adaptations = PROTOCOLS["idaq"](place, two_tests.test_tasks)
@@ -197,6 +205,7 @@ def test_evaluation_repeats_exactly_and_adds_up(trained: Path, tiny: Dataset, pr
     assert task.regret == pytest.approx(oracle(tiny, tiny.test_tasks[0]) - task.final)
     expected = (task.final - task.random) / (oracle(tiny, tiny.test_tasks[0]) - task.random)
     assert task.normalized == pytest.approx(expected)
+    assert task.reference == "oracle"
     assert len(task.returns) == 3
     assert first.mean_final == task.final
     assert first.mean_shuffled == task.shuffled
@@ -211,6 +220,7 @@ def test_without_an_oracle_regret_is_null_and_behavior_norms(
     result = evaluate_run(trained, protocol="offline")
     (task,) = result.tasks
     assert task.oracle is task.regret is result.mean_regret is None
+    assert task.reference == "behavior"
     expected = (task.final - references.uniform) / (references.behavior - references.uniform)
     assert task.normalized == pytest.approx(expected)
 
@@ -285,7 +295,7 @@ def test_evaluate_command_prints_the_documented_json(trained: Path, call: Call) 
     (task,) = document["tasks"]
     assert set(task) == {
         "task", "split", "returns", "final", "oracle", "random",
-        "regret", "normalized", "success", "shuffled",
+        "regret", "normalized", "reference", "success", "shuffled",
     }  # fmt: skip
     assert len(task["returns"]) == 4
     assert task["split"] == "test"

@@ -112,10 +112,9 @@ def test_frozen_call_passes_gradients_to_inputs_alone() -> None:
 def test_ensemble_members_are_separate_perceptrons() -> None:
     ensemble, inputs = PerceptronEnsemble(2, (3, 8), generator=generator()), random(5, 3)
     values = ensemble(inputs)
-    for member in range(2):
-        hidden = torch.relu(inputs @ ensemble.weights[0][member] + ensemble.biases[0][member])
-        expected = hidden @ ensemble.weights[1][member] + ensemble.biases[1][member]
-        torch.testing.assert_close(values[member], expected.squeeze(-1))
+    for member, network in enumerate(ensemble.members):
+        hidden = torch.relu(network.layers[0](inputs))
+        torch.testing.assert_close(values[member], network.layers[1](hidden).squeeze(-1))
     assert not torch.allclose(values[0], values[1])
 
 

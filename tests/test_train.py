@@ -13,9 +13,10 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_algo
 from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
+from tcmrl_algo.batches import JoinedBatches
 from tcmrl_algo.config import ALGORITHMS, TrainingSettings
 from tcmrl_algo.train import Progress
-from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
+from tcmrl_data import BatchSizes, CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
 from tcmrl_data.discovery import modules
 from tests.commands import Call, assert_refused, in_process
 
@@ -247,6 +248,48 @@ def test_a_loss_that_is_not_finite_stops_with_its_name_and_step(start: Train, tm
     with pytest.raises(TrainingError, match=r"is not finite at step \d+"):
         start("run", "optimizer.learning_rate=1e30", steps=50)
     assert not list((tmp_path / "run").glob("checkpoints/step_*"))
+
+
+def test_an_exploding_q_stops_with_its_name_and_step_and_keeps_the_last_checkpoint(
+    start: Train, tmp_path: Path
+) -> None:
+    wild = ("actor_critic.clip_targets=false", "actor_critic.divergence_factor=2", "actor_critic.tau=1")
+    rates = ("optimizer.learning_rate=0.3", "run.checkpoint_every=1")
+    with pytest.raises(TrainingError, match=r"actor_critic/largest_q is .*, beyond .* at step \d+") as caught:
+        start("run", *wild, *rates, steps=400)
+    step = int(str(caught.value).partition("at step ")[2].partition(";")[0])
+    assert open_run(tmp_path / "run").newest().step == step - 1  # the last one before
+    assert all(each.isfinite().all() for each in open_run(tmp_path / "run").newest().tensors().values())
+
+
+def test_contexts_may_come_from_other_snapshots_than_transitions(start: Train, tiny: Dataset) -> None:
+    digests = {
+        start(str(index), f"run.snapshots={own}", *other, steps=3).digest
+        for index, (own, other) in enumerate(
+            [
+                ("last", ()),
+                ("all", ()),
+                ("last", ["run.context_snapshots=all"]),
+                ("all", ["run.context_snapshots=last"]),
+            ]
+        )
+    }
+    assert len(digests) == 4
+
+
+def test_joined_batches_take_each_kind_from_its_selection(tiny: Dataset) -> None:
+    last, whole = (tiny.select(split="train", snapshots=each) for each in ("last", "all"))
+    stored = [each for task in last.tasks for each in last.trajectories(task.index)]
+    own = {float(reward) for each in stored for reward in each.rewards}
+    sizes = BatchSizes(tasks=3, transitions=9, context_trajectories=(1, 2), windows=2)
+    joined = JoinedBatches(last, whole, sizes, seed=0, device="cpu")
+    batches = [joined.batch(n) for n in range(10)]
+    assert all(each.transitions.rewards.shape == (3, 9) for each in batches)
+    assert all(set(each.transitions.rewards.flatten().tolist()) <= own for each in batches)
+    for part in ("context", "execution", "windows"):
+        seen = {value for each in batches for value in getattr(each, part).rewards.flatten().tolist()}
+        assert not seen <= own, part
+    assert joined.moments().reward_mean == last.sampler(sizes, seed=0).moments().reward_mean
 
 
 def test_progress_is_reported_with_rates(start: Train) -> None:
