@@ -150,7 +150,8 @@ class Trained:
         Raises:
             TcmrlError: the dataset is no longer where it was.
         """
-        place, snapshots = run.result.dataset, run.result.config.settings.run.snapshots
+        place, settings = run.result.dataset, run.result.config.settings.run
+        snapshots = settings.context_snapshots or settings.snapshots
         if (place, snapshots) not in self._stored:
             self._stored[place, snapshots] = Stored(open_dataset(place), snapshots)
         return self._stored[place, snapshots]
