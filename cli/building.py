@@ -1,11 +1,8 @@
 """`tcmrl-data plan` and `build`: from a recipe to a dataset."""
 
-import contextlib
 import dataclasses
-import signal
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -19,7 +16,7 @@ from .frame import (
     print_table,
     remark,
     size,
-    typed_command,
+    stopped_by_signals,
 )
 from .progress import StageProgress
 
@@ -171,7 +168,7 @@ def build(
     recipe = _load(environment, profile, behavior, overrides)
     chosen = _parse_tasks(recipe, tasks)
     out = out or Path("data") / environment
-    with _stopped_by_signals(out), StageProgress(quiet=quiet) as progress:
+    with stopped_by_signals(out), StageProgress(quiet=quiet) as progress:
         report = tcmrl_data.build_dataset(
             recipe,
             out,
@@ -192,22 +189,6 @@ def build(
     if report.failed:
         more = "" if len(report.failed) == 1 else f" (and {len(report.failed) - 1} more)"
         fail_incomplete(f"{report.failed[0]}{more}; the same command tries again what is missing")
-
-
-@contextlib.contextmanager
-def _stopped_by_signals(out: Path) -> Iterator[None]:
-    """Lets Ctrl-C and SIGTERM end a build in order, with one line that says how to go on."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    earlier = signal.signal(signal.SIGTERM, interrupt)
-    try:
-        yield
-    except KeyboardInterrupt:
-        fail_incomplete(f"interrupted; {out} keeps what is finished, to go on run `{typed_command()}` again")
-    finally:
-        signal.signal(signal.SIGTERM, earlier)
 
 
 def _load(environment: str, profile: str, behavior: str | None, overrides: tuple[str, ...]) -> "Recipe":

@@ -1,10 +1,14 @@
 """The frame around every command: options they share, one-line errors, exit codes, JSON and tables."""
 
+import contextlib
 import io
 import json
 import shlex
+import signal
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
@@ -66,6 +70,22 @@ def typed_command() -> str:
     """The running command as it was typed, to be run again."""
     context = click.get_current_context().find_root()
     return shlex.join([str(context.info_name), *context.obj])
+
+
+@contextlib.contextmanager
+def stopped_by_signals(out: Path) -> Iterator[None]:
+    """Lets Ctrl-C and SIGTERM end long work in order, with one line that says how to go on."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    earlier = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    except KeyboardInterrupt:
+        fail_incomplete(f"interrupted; {out} keeps what is finished, to go on run `{typed_command()}` again")
+    finally:
+        signal.signal(signal.SIGTERM, earlier)
 
 
 def output_options(command: Command) -> Command:

@@ -7,8 +7,10 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import click
 
+from .experiments import experiment
 from .frame import duration, output_options, print_json, print_table, remark, run
 from .progress import StageProgress
+from .reports import report
 from .scores import EXPLANATION, score_table
 
 if TYPE_CHECKING:
@@ -34,9 +36,15 @@ def tcmrl() -> None:
       tcmrl-data build point-robot --profile quick
       tcmrl train data/point-robot
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all
+      tcmrl experiment figure5 --workers 2
+      tcmrl report results/figure5
 
     Exit codes: 0 done, 1 work is incomplete, 2 bad usage or bad input.
     """
+
+
+tcmrl.add_command(experiment)
+tcmrl.add_command(report)
 
 
 @tcmrl.command()

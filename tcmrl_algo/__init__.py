@@ -12,7 +12,11 @@ if TYPE_CHECKING:
     from tcmrl_algo.config import TrainingConfig, TrainingSettings, resolve
     from tcmrl_algo.context_algorithm import ContextAlgorithm
     from tcmrl_algo.evaluate import Evaluation, TaskResult, evaluate_run
+    from tcmrl_algo.experiment.config import Experiment, experiment_names, load_experiment
+    from tcmrl_algo.experiment.driver import ExperimentReport, Finished, run_experiment
+    from tcmrl_algo.experiment.results import RunResult
     from tcmrl_algo.problem import Algorithm, Problem
+    from tcmrl_algo.reporting.write import Report, write_report
     from tcmrl_algo.train import Progress, TrainingReport, create_algorithm, resume_run, train_run
 
 _HOMES = {
@@ -21,7 +25,11 @@ _HOMES = {
     "config": ("TrainingConfig", "TrainingSettings", "resolve"),
     "context_algorithm": ("ContextAlgorithm",),
     "evaluate": ("Evaluation", "TaskResult", "evaluate_run"),
+    "experiment.config": ("Experiment", "experiment_names", "load_experiment"),
+    "experiment.driver": ("ExperimentReport", "Finished", "run_experiment"),
+    "experiment.results": ("RunResult",),
     "problem": ("Algorithm", "Problem"),
+    "reporting.write": ("Report", "write_report"),
     "train": ("Progress", "TrainingReport", "create_algorithm", "resume_run", "train_run"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
@@ -30,10 +38,15 @@ __all__ = [
     "Algorithm",
     "ContextAlgorithm",
     "Evaluation",
+    "Experiment",
+    "ExperimentReport",
+    "Finished",
     "Problem",
     "Progress",
+    "Report",
     "Run",
     "RunRecord",
+    "RunResult",
     "Summary",
     "TaskResult",
     "TrainingConfig",
@@ -41,11 +54,15 @@ __all__ = [
     "TrainingSettings",
     "create_algorithm",
     "evaluate_run",
+    "experiment_names",
+    "load_experiment",
     "open_run",
     "resolve",
     "resume_run",
+    "run_experiment",
     "summarize",
     "train_run",
+    "write_report",
 ]
 
 

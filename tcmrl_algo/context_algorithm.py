@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from tcmrl_algo.actor_critic import ActorCritic
 from tcmrl_algo.config import TrainingSettings
+from tcmrl_algo.networks import Attention
 from tcmrl_algo.optimizer import Adam
 from tcmrl_algo.problem import Algorithm, Metrics, Problem, TrainedModules
 from tcmrl_data import Batch, Controller, Steps, Trajectory, UniformController
@@ -51,6 +52,10 @@ class ContextLearner(nn.Module, abc.ABC):
     @abc.abstractmethod
     def context(self, steps: Steps) -> Float[Tensor, "lanes latent"]:
         """One context per lane, of all its trajectories together: (lanes, trajectories, steps)."""
+
+    def attention(self, steps: Steps) -> Attention | None:
+        """How the steps of each lane weigh in its context; None for a method without attention."""
+        return None
 
     def explore(self, actor_critic: ActorCritic, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         """As `Algorithm.explore`, for a method that collects its first episodes with its policy."""
@@ -108,6 +113,11 @@ class ContextAlgorithm(Algorithm):
         """One context per lane, of all its trajectories together; at least one trajectory each."""
         with torch.no_grad():
             return self.learner.context(pack(trajectories, self._problem.device))
+
+    def attention(self, trajectories: Sequence[Sequence[Trajectory]]) -> Attention | None:
+        """How the steps of each lane weigh in its context, trajectory after trajectory, padding included."""
+        with torch.no_grad():
+            return self.learner.attention(pack(trajectories, self._problem.device))
 
     def tensors(self) -> dict[str, Tensor]:
         return self._trained.tensors()

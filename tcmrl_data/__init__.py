@@ -14,6 +14,8 @@ if TYPE_CHECKING:
     from tcmrl_data.canonical import canonical_json, parse_json
     from tcmrl_data.dataset import Dataset, open_dataset
     from tcmrl_data.discovery import plugin
+    from tcmrl_data.engine import Unit
+    from tcmrl_data.engine.worker import serve
     from tcmrl_data.environment import (
         Controller,
         Environment,
@@ -56,6 +58,8 @@ _HOMES = {
     "canonical": ("canonical_json", "parse_json"),
     "dataset": ("Dataset", "open_dataset"),
     "discovery": ("plugin",),
+    "engine": ("Unit",),
+    "engine.worker": ("serve",),
     "environment": (
         "Controller",
         "Environment",
@@ -119,6 +123,7 @@ __all__ = [
     "TrainingError",
     "Trajectory",
     "UniformController",
+    "Unit",
     "VerifyLevel",
     "VerifyReport",
     "apply_overrides",
@@ -149,6 +154,7 @@ __all__ = [
     "repair_dataset",
     "return_table",
     "roll_out",
+    "serve",
     "verify_dataset",
 ]
 

@@ -90,21 +90,22 @@ def group_tasks(tasks: Iterable[Task], group_size: int) -> list[tuple[Task, ...]
     return [tuple(group) for _, group in groupby(ordered, key=lambda task: task.index // group_size)]
 
 
-def parse_indices(text: str, num_tasks: int) -> list[int]:
+def parse_indices(text: str, num_tasks: int, *, option: str = "--tasks") -> list[int]:
     """Indices named by text such as `0-9,12`, sorted.
 
     Raises:
-        TaskError: the text is no list of indices and ranges, or an index lies outside the task set.
+        TaskError: the text is no list of indices and ranges, or an index lies outside the task set; the
+            message names the option that the text came from.
     """
     indices: set[int] = set()
     for item in text.split(","):
         first, dash, last = item.strip().partition("-")
         if not first.isdecimal() or (dash and not last.isdecimal()):
-            raise TaskError(f"--tasks {text!r}: {item!r} is neither an index nor a range such as 0-9")
+            raise TaskError(f"{option} {text!r}: {item!r} is neither an index nor a range such as 0-9")
         start, stop = int(first), int(last or first)
         if stop < start:
-            raise TaskError(f"--tasks {text!r}: the range {item!r} runs backwards")
+            raise TaskError(f"{option} {text!r}: the range {item!r} runs backwards")
         if stop >= num_tasks:
-            raise TaskError(f"--tasks {text!r}: index {stop} does not exist, the tasks are 0-{num_tasks - 1}")
+            raise TaskError(f"{option} {text!r}: {stop} is too large, the last one is {num_tasks - 1}")
         indices.update(range(start, stop + 1))
     return sorted(indices)

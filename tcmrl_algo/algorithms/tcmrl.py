@@ -121,8 +121,11 @@ class TcmrlLearner(ContextLearner):
         self.similarity = nn.Parameter(torch.eye(config.latent))
 
     def context(self, steps: Steps) -> Float[Tensor, "lanes latent"]:
+        return self.attention(steps).context
+
+    def attention(self, steps: Steps) -> Attention:
         (representations,) = self.encoder(self.encoder.read(steps))
-        return self._attend(representations.flatten(1, 2), steps.mask.flatten(1, 2)).context
+        return self._attend(representations.flatten(1, 2), steps.mask.flatten(1, 2))
 
     def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
         """The weighted terms; those of weight 0 are not computed.

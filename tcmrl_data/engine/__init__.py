@@ -20,7 +20,9 @@ class Unit:
 
     Attributes:
         id: names the unit in messages and logs.
-        spec: JSON, understood by `tcmrl_data.unit`.
+        spec: JSON, understood by the worker.
+        worker: the module that does it, run as a process of its own; it serves by `serve`.
+        threads: of that process's libraries.
         cost: relative length, for starting the longest first.
         cpus: cores to reserve, on engines that know several machines.
         gpus: graphics processors to reserve there; a fraction shares one.
@@ -30,6 +32,8 @@ class Unit:
 
     id: str
     spec: Mapping[str, Any]
+    worker: str = "tcmrl_data.engine.worker"
+    threads: int = 1
     cost: float = 1.0
     cpus: float = 1.0
     gpus: float = 0.0

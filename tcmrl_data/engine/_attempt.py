@@ -14,7 +14,7 @@ from typing import IO, Any
 
 from tcmrl_data.engine import Result, Unit
 
-ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 POLL_SECONDS = 0.1
 GRACE_SECONDS = 5.0
 """Between asking a worker to end and killing it."""
@@ -52,7 +52,7 @@ def run_attempt(
     with contextlib.ExitStack() as stack:
         errors = stack.enter_context(tempfile.TemporaryFile("w+", errors="replace"))
         try:
-            process = stack.enter_context(_start_worker(errors))
+            process = stack.enter_context(_start_worker(unit, errors))
         except OSError as error:
             return Outcome(crash=f"no worker could be started: {error}")
         stack.callback(_hang_up, process)
@@ -71,14 +71,14 @@ def run_attempt(
         return Outcome(crash=ended or f"worker {_exit(process)}: {_last_line(errors)}")
 
 
-def _start_worker(errors: IO[str]) -> "subprocess.Popen[str]":
+def _start_worker(unit: Unit, errors: IO[str]) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [sys.executable, "-m", "tcmrl_data.engine.worker"],
+        [sys.executable, "-m", unit.worker],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=errors,
         text=True,
-        env=os.environ | ONE_THREAD,
+        env=os.environ | dict.fromkeys(THREADS, str(unit.threads)),
         start_new_session=True,  # Ctrl-C in a terminal reaches the driver alone, which then ends its workers
     )
 

@@ -11,7 +11,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from types import FrameType
 from typing import Any
 
@@ -56,22 +56,31 @@ def _abandon(signal_number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + signal_number)
 
 
-def main() -> None:
-    """Runs the unit whose spec is the first line of standard input."""
+def serve(work: Callable[[dict[str, Any], Callable[[Mapping[str, Any]], None]], str]) -> None:
+    """Makes this process a worker: does the unit whose spec is the first line of standard input.
+
+    Args:
+        work: from a spec and a receiver of messages to the digest of what was done; what it raises as
+            `TcmrlError` is the unit's error and is not tried again.
+    """
     signal.signal(signal.SIGTERM, _abandon)
-    spec = UnitSpec.from_json(json.loads(sys.stdin.readline()))
+    spec = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
     report = _Reporter()
-    import torch
-
-    torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently
     try:
-        report({"kind": "result", "digest": run_unit(spec, report)})
+        report({"kind": "result", "digest": work(spec, report)})
     except TcmrlError as error:
         report({"kind": "result", "error": str(error)})
     sys.stderr.flush()
     os._exit(0)  # all is written and told; taking the libraries down in order would take a second
 
 
+def _build_parts(spec: dict[str, Any], report: Callable[[Mapping[str, Any]], None]) -> str:
+    import torch
+
+    torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently
+    return run_unit(UnitSpec.from_json(spec), report)
+
+
 if __name__ == "__main__":
-    main()
+    serve(_build_parts)

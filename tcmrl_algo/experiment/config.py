@@ -1,0 +1,189 @@
+"""An experiment file, validated whole: what is compared, on what, and what is claimed of it."""
+
+import importlib.resources
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from tcmrl_algo.config import Protocol, validated
+from tcmrl_data import TrainingError
+
+Metric = Literal[
+    "final",
+    "curve",
+    "regret",
+    "normalized",
+    "shuffled",
+    "training_seconds",
+    "peak_memory",
+    "attention_zero",
+    "attention_nonzero",
+]
+"""What a claim compares; `reporting.measures` says how each comes from a run."""
+
+
+class _Table(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class EnvironmentChoice(_Table):
+    """One `[environments.NAME]` table.
+
+    Attributes:
+        dataset: its folder; `NAME` below the folder of datasets where unset.
+        profile: whose training table to start from; the one the dataset was built with where unset.
+        training: changes of that table.
+    """
+
+    dataset: str | None = None
+    profile: str | None = None
+    training: dict[str, Any] = {}
+
+
+class Method(_Table):
+    """One `[methods.LABEL]` table.
+
+    Attributes:
+        algorithm: a file of `tcmrl_algo/algorithms`.
+        training: changes of the training table, after those of the experiment and the environment.
+    """
+
+    algorithm: str
+    training: dict[str, Any] = {}
+
+
+class Claim(_Table):
+    """One `[[claims]]` table: that one quantity is better than another, seed by seed.
+
+    Attributes:
+        text: the claim in words.
+        better: label of the method that is said to be better.
+        worse: label of the method that it is held against; may be the same, with another metric.
+        metric: what is compared; a lower regret, time or memory is better, a higher anything else.
+        against: what is taken from `worse`, where that is another metric.
+        protocol: of evaluation; the experiment's first where unset.
+    """
+
+    text: str
+    better: str
+    worse: str
+    metric: Metric = "final"
+    against: Metric | None = None
+    protocol: Protocol | None = None
+
+
+class Experiment(_Table):
+    """A whole experiment file.
+
+    Attributes:
+        name: of its results folder.
+        title: one line.
+        source: the figure or table of the paper that it stands for.
+        seeds: every method is run under each of them.
+        environments: by name.
+        methods: by label, in the order of tables and figures.
+        training: changes of the training table that all runs share.
+        protocols: by which trained runs are evaluated; learning curves are by the first.
+        curve_points: evenly spaced steps at which a learning curve is evaluated.
+        claims: what the experiment decides.
+    """
+
+    schema_version: Literal[1] = Field(alias="schema")
+    name: str = Field(pattern=r"^[a-z0-9_-]{1,64}$")
+    title: str
+    source: str
+    seeds: tuple[int, ...] = Field(min_length=1)
+    environments: dict[str, EnvironmentChoice] = Field(min_length=1)
+    methods: dict[str, Method] = Field(min_length=1)
+    training: dict[str, Any] = {}
+    protocols: tuple[Protocol, ...] = Field(default=get_args(Protocol), min_length=1)
+    curve_points: int = Field(default=5, ge=1)
+    claims: tuple[Claim, ...] = ()
+
+    @model_validator(mode="after")
+    def _consistent(self) -> "Experiment":
+        folders = [folder_name(label) for label in self.methods]
+        for what, values in (("seeds", self.seeds), ("protocols", self.protocols), ("methods", folders)):
+            if len(set(values)) < len(values) or "" in values:
+                raise ValueError(f"{what} must be distinct names or numbers, got {list(values)}")
+        if min(self.seeds) < 0:
+            raise ValueError(f"seeds must not be negative, got {list(self.seeds)}")
+        for claim in self.claims:
+            for label in (claim.better, claim.worse):
+                if label not in self.methods:
+                    known = ", ".join(map(repr, self.methods))
+                    raise ValueError(f"claim {claim.text!r} names no method {label!r}; they are {known}")
+            if claim.protocol not in (None, *self.protocols):
+                raise ValueError(f"claim {claim.text!r}: protocol {claim.protocol!r} is not evaluated")
+        return self
+
+    def to_json(self) -> dict[str, Any]:
+        """What `read_experiment` takes back."""
+        return self.model_dump(mode="json", by_alias=True)
+
+
+def load_experiment(name: str | Path) -> Experiment:
+    """An experiment from a TOML file, or by the name of one that comes with the package.
+
+    Raises:
+        TrainingError: no such file or name, no TOML, an unknown key, a wrong type or a contradiction.
+
+    Example:
+        >>> load_experiment("figure5").source
+        'Figure 5'
+    """
+    file: Path | Traversable = Path(name)
+    if Path(name).suffix != ".toml" and re.fullmatch(r"[a-z0-9_-]+", str(name)):
+        file = _shipped() / f"{name}.toml"
+    try:
+        tables = tomllib.loads(file.read_text(encoding="utf-8"))
+    except (FileNotFoundError, IsADirectoryError):
+        known = ", ".join(experiment_names())
+        raise TrainingError(f"no experiment {str(name)!r}: neither a TOML file nor one of {known}") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise TrainingError(f"{name} is no TOML file: {error}") from None
+    return read_experiment(tables, place=f"experiment {str(name)!r}")
+
+
+def read_experiment(tables: Mapping[str, Any], *, place: str) -> Experiment:
+    """An experiment from what its file holds.
+
+    Raises:
+        TrainingError: names the first problem and the place.
+    """
+    return validated(Experiment, tables, place)
+
+
+def experiment_names() -> list[str]:
+    """Experiments that come with the package."""
+    names = [each.name for each in _shipped().iterdir()]
+    return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
+
+
+def folder_name(text: str) -> str:
+    """A label as part of a file name: `TCMRL w/o TCE` becomes `tcmrl-w-o-tce`."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+
+
+def run_id(environment: str, method: str, seed: int) -> str:
+    """Names a run's files in a results folder."""
+    return f"{folder_name(environment)}--{folder_name(method)}--seed{seed}"
+
+
+def override_texts(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """Nested tables as the `section.key=value` texts that `resolve` takes; JSON values are TOML values."""
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            yield from override_texts(value, f"{prefix}{key}.")
+        else:
+            yield f"{prefix}{key}={json.dumps(value)}"
+
+
+def _shipped() -> Traversable:
+    return importlib.resources.files("tcmrl_manifests") / "experiments"

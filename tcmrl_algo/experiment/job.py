@@ -1,0 +1,176 @@
+"""The process of one run: `python -m tcmrl_algo.experiment.job`, a JSON job on standard input.
+
+It trains up to the next point of the learning curve, evaluates there, writes the point down, and so on; a
+killed one goes on from the newest checkpoint and ends in the same tensors.
+"""
+
+import importlib.metadata
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from pydantic import BaseModel, ConfigDict
+
+from tcmrl_algo.checkpoint import open_run
+from tcmrl_algo.config import Protocol, TrainingConfig
+from tcmrl_algo.evaluate import Evaluation, evaluate_run
+from tcmrl_algo.experiment.results import CurvePoint, RunResult, read_record, write_record
+from tcmrl_algo.train import Progress, digest, resume_run, train_run
+from tcmrl_data import CheckpointError, Dataset, open_dataset, serve
+
+Report = Callable[[Mapping[str, Any]], None]
+MEANS = ("final", "regret", "normalized", "shuffled")
+
+
+class Job(BaseModel):
+    """What a worker is told; kept as `job.json` in the run's folder.
+
+    Attributes:
+        experiment, method, environment, seed, profile: which run it is.
+        dataset, root: what it learns from, by an absolute path.
+        folder: the run's, absolute; the result is written beside it.
+        identity: of `PlannedRun`.
+        config: resolved, `run.threads` included.
+        device: a torch device.
+        protocols, curve_points: how it is evaluated.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    experiment: str
+    method: str
+    environment: str
+    seed: int
+    profile: str
+    dataset: str
+    root: str
+    folder: str
+    identity: dict[str, Any]
+    config: TrainingConfig
+    device: str
+    protocols: tuple[Protocol, ...]
+    curve_points: int
+
+    def points(self) -> list[int]:
+        """Steps at which the learning curve is evaluated; the last one is the end of training."""
+        steps = self.config.settings.run.steps
+        return [round(steps * (index + 1) / self.curve_points) for index in range(self.curve_points)]
+
+
+class Curve(BaseModel):
+    """`curve.json` in a run's folder: the points so far."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    points: tuple[CurvePoint, ...] = ()
+
+
+def result_file(folder: Path) -> Path:
+    """Where the result of the run in a folder is written, as its last deed."""
+    return folder.with_name(f"{folder.name}.json")
+
+
+def run_job(job: Job, report: Report) -> str:
+    """Does a run, or what is missing of it; the digest of its tensors.
+
+    Raises:
+        TcmrlError: it cannot be trained or evaluated.
+    """
+    folder, dataset = Path(job.folder), open_dataset(job.dataset)
+    if dataset.manifest.root != job.root:
+        raise CheckpointError(f"{job.dataset} was changed after this experiment began; start it anew")
+    file = folder / "curve.json"
+    curve = read_record(Curve, file).points if file.is_file() else ()
+    evaluations: dict[str, Evaluation] = {}
+    for step in job.points()[len(curve) :]:
+        timed_steps, seconds = _train_to(step, job, dataset, report)
+        began = time.perf_counter()
+        chosen = job.protocols if step == job.points()[-1] else job.protocols[:1]
+        evaluations = {each: evaluate_run(folder, protocol=each, dataset_path=job.dataset) for each in chosen}
+        first = evaluations[job.protocols[0]]
+        point = CurvePoint(
+            step=step,
+            **{name: getattr(first, f"mean_{name}") for name in MEANS},
+            timed_steps=timed_steps,
+            seconds=seconds,
+            evaluation_seconds=time.perf_counter() - began,
+            peak_memory=_peak_memory(),
+            device_memory=torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0,
+        )
+        curve = (*curve, point)
+        if step < job.points()[-1]:
+            write_record(file, Curve(points=curve))
+    result = _result(job, curve, evaluations)
+    write_record(result_file(folder), result)
+    return result.digest
+
+
+def _train_to(step: int, job: Job, dataset: Dataset, report: Report) -> tuple[int, float]:
+    """Trains up to a step; how many steps that took here, and how long."""
+    folder = Path(job.folder)
+    is_begun = (folder / "run.json").is_file()
+    checkpoints = open_run(folder).checkpoints() if is_begun else []
+    start = reported = checkpoints[-1].step if checkpoints else 0
+    if start == step:
+        return 0, 0.0
+
+    def show(progress: Progress) -> None:
+        nonlocal reported
+        report({"kind": "steps", "count": progress.step - reported})
+        reported = progress.step
+
+    if is_begun:
+        return step - start, resume_run(folder, dataset, steps=step, report=show).seconds
+    done = train_run(
+        dataset,
+        folder,
+        config=job.config,
+        profile=job.profile,
+        seed=job.seed,
+        steps=step,
+        device=job.device,
+        report=show,
+    )
+    return step, done.seconds
+
+
+def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: Mapping[str, Evaluation]) -> RunResult:
+    run = open_run(job.folder)
+    timed, seconds = sum(each.timed_steps for each in curve), sum(each.seconds for each in curve)
+    steps = run.record.steps
+    return RunResult(
+        **job.model_dump(
+            include={"experiment", "method", "environment", "seed", "profile", "dataset", "root"}
+        ),
+        algorithm=job.config.settings.run.algorithm,
+        steps=steps,
+        device=run.record.device,
+        threads=run.record.config.settings.run.threads,
+        identity=job.identity,
+        config=run.record.config,
+        versions=run.record.versions | {"tcmrl": importlib.metadata.version("tcmrl")},
+        digest=digest(run.newest().tensors()),
+        curve=curve,
+        evaluations={name: each.to_json() for name, each in evaluations.items()},
+        training_seconds=seconds * steps / timed if timed else None,
+        evaluation_seconds=sum(each.evaluation_seconds for each in curve),
+        peak_memory=max(each.device_memory or each.peak_memory for each in curve),
+    )
+
+
+def _peak_memory() -> int:
+    """Bytes that this process held at most; Linux keeps count (`getrusage` would count the driver's too)."""
+    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    return 0
+
+
+def _serve(spec: dict[str, Any], report: Report) -> str:
+    return run_job(Job.model_validate(spec), report)
+
+
+if __name__ == "__main__":
+    serve(_serve)

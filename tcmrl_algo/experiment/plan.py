@@ -1,0 +1,166 @@
+"""All runs of an experiment, resolved and checked before the first one starts."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tcmrl_algo.config import TrainingConfig, resolve
+from tcmrl_algo.experiment.config import EnvironmentChoice, Experiment, override_texts, run_id
+from tcmrl_data import CheckpointError, Dataset, SelectionError, TrainingError, open_dataset
+
+
+@dataclass(frozen=True)
+class PlannedRun:
+    """One run to do.
+
+    Attributes:
+        id: names its files.
+        environment, method, seed: which run it is.
+        dataset, root: what it learns from.
+        profile: whose training table it starts from.
+        config: the resolved configuration; its `run.threads` is the driver's to set.
+        protocols, curve_points: how it is evaluated.
+    """
+
+    id: str
+    environment: str
+    method: str
+    seed: int
+    dataset: Path
+    root: str
+    profile: str
+    config: TrainingConfig
+    protocols: tuple[str, ...]
+    curve_points: int
+
+    def identity(self) -> dict[str, Any]:
+        """Everything that the run's result is a function of, beside code, device and threads."""
+        config = self.config.model_dump(mode="json")
+        del config["settings"]["run"]["threads"]
+        return {
+            "root": self.root,
+            "seed": self.seed,
+            "training": config["settings"] | {self.config.settings.run.algorithm: config["method"]},
+            "protocols": list(self.protocols),
+            "curve_points": self.curve_points,
+        }
+
+
+def plan_runs(
+    experiment: Experiment,
+    *,
+    data: Path,
+    only: Sequence[str] = (),
+    seeds: Sequence[int] | None = None,
+    steps: int | None = None,
+) -> list[PlannedRun]:
+    """Every run, all methods under one seed before the next seed.
+
+    Args:
+        experiment: the file.
+        data: folder of datasets, one per environment.
+        only: labels of methods; all where empty.
+        seeds: instead of the experiment's.
+        steps: training steps instead of `run.steps`, of runs and schedules.
+
+    Raises:
+        SelectionError: a dataset is missing, of another environment, or without test tasks.
+        TrainingError: an unknown method, algorithm or profile, or changes that do not validate.
+    """
+    unknown = [label for label in only if label not in experiment.methods]
+    if unknown:
+        known = ", ".join(map(repr, experiment.methods))
+        raise TrainingError(f"--only {unknown[0]!r}: {experiment.name} has no such method; they are {known}")
+    runs = []
+    for environment, choice in experiment.environments.items():
+        dataset = _dataset(environment, choice, data)
+        profile = choice.profile or dataset.manifest.profile
+        configs = {
+            label: _config(experiment, dataset, profile, label, steps)
+            for label in experiment.methods
+            if not only or label in only
+        }
+        runs += [
+            PlannedRun(
+                id=run_id(environment, label, seed),
+                environment=environment,
+                method=label,
+                seed=seed,
+                dataset=dataset.folder.resolve(),
+                root=dataset.manifest.root,
+                profile=profile,
+                config=config,
+                protocols=experiment.protocols,
+                curve_points=experiment.curve_points,
+            )
+            for seed in (experiment.seeds if seeds is None else seeds)
+            for label, config in configs.items()
+        ]
+    return runs
+
+
+def check_same(done: Mapping[str, Any], planned: Mapping[str, Any], *, place: Path) -> None:
+    """Refuses to go on with a run that was begun with other settings or data.
+
+    Raises:
+        CheckpointError: names the first value that differs.
+    """
+    before, now = dict(_leaves(done)), dict(_leaves(planned))
+    for key in sorted(before.keys() | now.keys()):
+        if before.get(key) != now.get(key):
+            raise CheckpointError(
+                f"{place} was made with {key} {before.get(key)!r}, this experiment asks for "
+                f"{now.get(key)!r}; choose another --out, or delete that run"
+            )
+
+
+def _dataset(environment: str, choice: EnvironmentChoice, data: Path) -> Dataset:
+    folder = Path(choice.dataset) if choice.dataset else data / environment
+    if not (folder / "manifest.json").is_file():
+        profile = f" --profile {choice.profile}" if choice.profile else ""
+        raise SelectionError(
+            f"no dataset of {environment!r} at {folder}; build it with "
+            f"`tcmrl-data build {environment}{profile} --out {folder}`, or say with --data where it lies"
+        )
+    dataset = open_dataset(folder)
+    if dataset.name != environment:
+        raise SelectionError(f"{folder} holds {dataset.name!r}, the experiment needs {environment!r}")
+    if not dataset.test_tasks or len(dataset.train_tasks) < 2:
+        raise SelectionError(
+            f"{folder} holds {len(dataset.train_tasks)} training and {len(dataset.test_tasks)} test tasks, "
+            f"an experiment needs 2 and 1; extend it with `tcmrl-data build {environment} --tasks`"
+        )
+    return dataset
+
+
+def _config(
+    experiment: Experiment, dataset: Dataset, profile: str, label: str, steps: int | None
+) -> TrainingConfig:
+    place = f"experiment {experiment.name!r}, method {label!r} on {dataset.name!r}, profile {profile!r}"
+    table = {str(name): each for name, each in dataset.manifest.training.items()}.get(profile)
+    if table is None:
+        known = ", ".join(dataset.manifest.training)
+        raise TrainingError(f"{place}: the dataset has no such training table; it has {known}")
+    method = experiment.methods[label]
+    changes = (experiment.training, experiment.environments[dataset.name].training, method.training)
+    texts = [text for each in changes for text in override_texts(each)]
+    if steps is not None:
+        texts.append(f"run.steps={steps}")
+    config = resolve(table, place=place, algorithm=method.algorithm, overrides=texts)
+    if config.settings.run.steps < experiment.curve_points:
+        raise TrainingError(
+            f"{place}: {experiment.curve_points} curve_points need as many steps, not "
+            f"{config.settings.run.steps}"
+        )
+    return config
+
+
+def _leaves(value: Any, prefix: str = "") -> list[tuple[str, Any]]:
+    if isinstance(value, Mapping):
+        return [
+            leaf
+            for key, each in value.items()
+            for leaf in _leaves(each, f"{prefix}.{key}".removeprefix(".").removeprefix("training."))
+        ]
+    return [(prefix, value)]

@@ -1,0 +1,166 @@
+"""What a run of an experiment leaves: one JSON document, one row of the table per protocol."""
+
+import csv
+import io
+import os
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from tcmrl_algo.config import TrainingConfig
+from tcmrl_algo.experiment.config import Experiment
+from tcmrl_data import CheckpointError, first_problem
+
+COLUMNS = (
+    "environment",
+    "method",
+    "algorithm",
+    "seed",
+    "protocol",
+    "final",
+    "regret",
+    "normalized",
+    "shuffled",
+    "steps",
+    "training_seconds",
+    "evaluation_seconds",
+    "peak_memory",
+    "root",
+    "digest",
+)
+Record = TypeVar("Record", bound=BaseModel)
+
+
+class _Record(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class CurvePoint(_Record):
+    """One point of a learning curve, and what it took to get there.
+
+    Attributes:
+        step: training steps done.
+        final, regret, normalized, shuffled: means over test tasks under the experiment's first protocol.
+        timed_steps, seconds: of training since the last point, as far as this process did it.
+        evaluation_seconds: of all evaluation at this point.
+        peak_memory: bytes, of the process, so far.
+        device_memory: bytes, of tensors on a CUDA device, so far; 0 on the CPU.
+    """
+
+    step: int
+    final: float
+    regret: float | None
+    normalized: float | None
+    shuffled: float
+    timed_steps: int
+    seconds: float
+    evaluation_seconds: float
+    peak_memory: int
+    device_memory: int
+
+
+class RunResult(_Record):
+    """A finished run: where it came from, what it learned, what it took.
+
+    Attributes:
+        experiment, method, algorithm, environment, seed, profile: which run this is.
+        dataset, root: the dataset and its Merkle root.
+        steps, device, threads: of training; results depend on device and threads in their last bits.
+        identity: everything that the result is a function of, beside the code.
+        config: the resolved training configuration.
+        versions: of the packages that results depend on.
+        digest: sha256 over all tensors, by which two runs compare.
+        curve: the learning curve.
+        evaluations: by protocol, the documents of `tcmrl evaluate --json`.
+        training_seconds: of training alone, scaled up to all steps where a killed process did some of
+            them; None where none was timed.
+        evaluation_seconds: of all evaluations.
+        peak_memory: bytes, of the process, or of the CUDA device where there is one.
+    """
+
+    schema_version: Literal[1] = 1
+    experiment: str
+    method: str
+    algorithm: str
+    environment: str
+    seed: int
+    profile: str
+    dataset: str
+    root: str
+    steps: int
+    device: str
+    threads: int
+    identity: dict[str, Any]
+    config: TrainingConfig
+    versions: dict[str, str]
+    digest: str
+    curve: tuple[CurvePoint, ...]
+    evaluations: dict[str, dict[str, Any]]
+    training_seconds: float | None
+    evaluation_seconds: float | None
+    peak_memory: int | None
+
+    def rows(self) -> list[dict[str, Any]]:
+        """Rows of the table, one per protocol."""
+        shared = self.model_dump(include=set(COLUMNS))
+        return [
+            shared
+            | {"protocol": protocol}
+            | {name: each[f"mean_{name}"] for name in ("final", "regret", "normalized", "shuffled")}
+            for protocol, each in self.evaluations.items()
+        ]
+
+
+def table_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = COLUMNS) -> str:
+    """Rows as CSV; None becomes an empty field."""
+    stream = io.StringIO()
+    writer = csv.DictWriter(stream, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return stream.getvalue()
+
+
+def write_text(file: Path, text: str) -> None:
+    """Writes a file whole or not at all, and durably."""
+    temporary = file.with_name(f".{file.name}-{uuid.uuid4().hex}")
+    with temporary.open("x", encoding="utf-8") as stream:
+        stream.write(text)
+        stream.flush()
+        os.fsync(stream.fileno())
+    temporary.replace(file)
+
+
+def write_record(file: Path, record: BaseModel) -> None:
+    """Writes a record as JSON, whole or not at all."""
+    write_text(file, record.model_dump_json(indent=1) + "\n")
+
+
+def read_record(kind: type[Record], file: Path) -> Record:
+    """Takes back what `write_record` wrote.
+
+    Raises:
+        CheckpointError: missing, or not such a record.
+    """
+    try:
+        return kind.model_validate_json(file.read_bytes())
+    except OSError as error:
+        raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
+    except ValidationError as error:
+        raise CheckpointError(
+            f"{file}: {first_problem(error)}; delete it, and the run is done again"
+        ) from None
+
+
+def read_results(folder: Path, experiment: Experiment) -> list[RunResult]:
+    """Every finished run in a results folder by environment, method (as the experiment orders them) and seed.
+
+    Raises:
+        CheckpointError: a result is not what a run writes.
+    """
+    results = [read_record(RunResult, file) for file in sorted(folder.glob("runs/*.json"))]
+    order = list(experiment.methods)
+    known = [each for each in results if each.method in order]
+    return sorted(known, key=lambda each: (each.environment, order.index(each.method), each.seed))

@@ -1,0 +1,193 @@
+"""What trained contexts look like: how tasks lie apart, and what the attention rests on."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from tcmrl_algo.checkpoint import open_run
+from tcmrl_algo.context_algorithm import ContextAlgorithm
+from tcmrl_algo.reporting.sources import FinishedRun
+from tcmrl_algo.train import create_algorithm
+from tcmrl_data import Dataset, Task, Trajectory, open_dataset
+
+NUM_TASKS = 20
+"""As many tasks as in the paper's t-SNE figures (Appendix G.7)."""
+PER_TASK = 20
+"""Trajectories of each, which make one context each."""
+FloatArray = npt.NDArray[np.floating[Any]]
+IntArray = npt.NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class TransitionWeights:
+    """Attention within single trajectories, times their length: 1 is what even attention would give.
+
+    Attributes:
+        zero, nonzero: weights of transitions with and without zero reward, from trajectories that hold both.
+        by_step: (steps,), mean over trajectories at every step; NaN where none is that long.
+        example: weights along one trajectory of a test task.
+        example_rewards: its rewards.
+    """
+
+    zero: FloatArray
+    nonzero: FloatArray
+    by_step: FloatArray
+    example: FloatArray
+    example_rewards: FloatArray
+
+
+@final
+class Stored:
+    """Trajectories of a dataset that contexts are made of: evenly spaced tasks, evenly spaced episodes."""
+
+    def __init__(self, dataset: Dataset, snapshots: str) -> None:
+        tasks = sorted((*dataset.train_tasks, *dataset.test_tasks), key=lambda task: task.index)
+        self.dataset = dataset
+        self.tasks: list[Task] = [tasks[index] for index in _spaced(len(tasks), NUM_TASKS)]
+        self.trajectories: list[list[Trajectory]] = []
+        for task in self.tasks:
+            found = dataset.select(tasks=[task.index], snapshots=snapshots).trajectories(task.index)
+            self.trajectories.append([found[index] for index in _spaced(len(found), PER_TASK)])
+
+    @property
+    def lanes(self) -> list[list[Trajectory]]:
+        """Every trajectory alone, task by task."""
+        return [[each] for lane in self.trajectories for each in lane]
+
+    @property
+    def labels(self) -> IntArray:
+        """The task of every lane, by its place in `tasks`."""
+        return np.repeat(np.arange(len(self.tasks)), [len(each) for each in self.trajectories])
+
+
+@final
+class TrainedContexts:
+    """Contexts and attention of one finished run.
+
+    Args:
+        run: whose newest checkpoint is read.
+        stored: of the dataset that the run was trained on.
+
+    Raises:
+        CheckpointError: the run has no checkpoint, or another dataset.
+    """
+
+    def __init__(self, run: FinishedRun, stored: Stored) -> None:
+        opened = open_run(run.folder)
+        opened.check_dataset(stored.dataset)
+        record = opened.record.model_copy(update={"device": "cpu"})
+        algorithm = create_algorithm(record, stored.dataset)
+        algorithm.load_tensors(opened.newest().tensors())
+        self._algorithm, self._stored = algorithm, stored
+
+    @cached_property
+    def contexts(self) -> FloatArray | None:
+        """(trajectories, latent), None for a method without contexts."""
+        if not isinstance(self._algorithm, ContextAlgorithm):
+            return None
+        found: FloatArray = self._algorithm.context(self._stored.lanes).cpu().numpy()
+        return found if found.shape[1] else None
+
+    @cached_property
+    def weights(self) -> TransitionWeights | None:
+        """None for a method without attention."""
+        if not isinstance(self._algorithm, ContextAlgorithm):
+            return None
+        attention = self._algorithm.attention(self._stored.lanes)
+        if attention is None:
+            return None
+        rows = [
+            weights[mask].numpy() * int(mask.sum())
+            for weights, mask in zip(attention.weights.cpu(), attention.mask.cpu(), strict=True)
+        ]
+        return _transition_weights(rows, self._stored)
+
+    def distance_ratio(self) -> float | None:
+        """Mean distance between contexts of one task over that between contexts of two; below 1 is apart."""
+        return None if self.contexts is None else distance_ratio(self.contexts, self._stored.labels)
+
+
+def distance_ratio(contexts: FloatArray, labels: IntArray) -> float | None:
+    """Mean distance within tasks over mean distance between them; None where all contexts are equal.
+
+    Example:
+        >>> import numpy as np
+        >>> distance_ratio(np.array([[0.0], [1.0], [4.0], [5.0]]), np.array([0, 0, 1, 1]))
+        0.25
+    """
+    distances = np.linalg.norm(contexts[:, None] - contexts[None], axis=-1)
+    same = labels[:, None] == labels[None]
+    pairs = ~np.eye(len(labels), dtype=bool)
+    between = float(distances[~same].mean()) if (~same).any() else 0.0
+    return float(distances[same & pairs].mean()) / between if between and (same & pairs).any() else None
+
+
+def embed(contexts: FloatArray) -> FloatArray:
+    """t-SNE (van der Maaten & Hinton, 2008) of contexts, from a fixed start: (points, 2)."""
+    from sklearn.manifold import TSNE
+
+    perplexity = min(30.0, (len(contexts) - 1) / 3)
+    result: FloatArray = TSNE(perplexity=perplexity, init="pca", random_state=0).fit_transform(contexts)
+    return result
+
+
+@final
+class Trained:
+    """Contexts and attention of finished runs, each read once, when first asked for."""
+
+    def __init__(self) -> None:
+        self._stored: dict[tuple[str, str], Stored] = {}
+        self._contexts: dict[Path, TrainedContexts] = {}
+
+    def stored(self, run: FinishedRun) -> Stored:
+        """Trajectories of the dataset that a run was trained on.
+
+        Raises:
+            TcmrlError: the dataset is no longer where it was.
+        """
+        place, settings = run.result.dataset, run.result.config.settings.run
+        snapshots = settings.context_snapshots or settings.snapshots
+        if (place, snapshots) not in self._stored:
+            self._stored[place, snapshots] = Stored(open_dataset(place), snapshots)
+        return self._stored[place, snapshots]
+
+    def contexts(self, run: FinishedRun) -> TrainedContexts:
+        """A run's contexts and attention.
+
+        Raises:
+            TcmrlError: the dataset or the run's checkpoint is no longer where it was.
+        """
+        if run.folder not in self._contexts:
+            self._contexts[run.folder] = TrainedContexts(run, self.stored(run))
+        return self._contexts[run.folder]
+
+
+def _transition_weights(rows: Sequence[FloatArray], stored: Stored) -> TransitionWeights:
+    trajectories = [lane[0] for lane in stored.lanes]
+    zero, nonzero = [], []
+    for weights, trajectory in zip(rows, trajectories, strict=True):
+        is_zero = np.asarray(trajectory.rewards) == 0.0
+        if is_zero.any() and not is_zero.all():
+            zero.append(weights[is_zero])
+            nonzero.append(weights[~is_zero])
+    by_step = np.full((len(rows), max(map(len, rows))), np.nan)
+    for row, weights in enumerate(rows):
+        by_step[row, : len(weights)] = weights
+    test = [lane for lane, task in enumerate(stored.labels) if stored.tasks[task].split == "test"]
+    example = max(test or range(len(rows)), key=lambda lane: trajectories[lane].undiscounted_return)
+    return TransitionWeights(
+        zero=np.concatenate(zero) if zero else np.empty(0),
+        nonzero=np.concatenate(nonzero) if nonzero else np.empty(0),
+        by_step=np.nanmean(by_step, axis=0),
+        example=rows[example],
+        example_rewards=np.asarray(trajectories[example].rewards),
+    )
+
+
+def _spaced(length: int, most: int) -> list[int]:
+    return [int(each) for each in np.linspace(0, length - 1, min(length, most)).round()]

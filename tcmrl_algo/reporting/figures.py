@@ -1,0 +1,128 @@
+"""Figures of a report, as PNG files; drawn without a window."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tcmrl_algo.aggregate import summarize
+from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.reporting.contexts import FloatArray, IntArray, TransitionWeights
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+WIDTH, HEIGHT = 4.6, 3.6
+"""Inches of one panel."""
+
+
+def draw_curves(file: Path, title: str, results: Sequence[RunResult], protocol: str) -> None:
+    """Mean return of the test tasks over training; intervals from five seeds, else the seeds' own lines."""
+    figure, (axes,) = _panels(1, width=1.5 * WIDTH)
+    for index, (method, runs) in enumerate(_by_method(results).items()):
+        color = f"C{index % 10}"
+        steps = [point.step for point in runs[0].curve]
+        finals = [[point.final for point in run.curve] for run in runs]
+        points = [summarize(each) for each in zip(*finals, strict=True)]
+        axes.plot(steps, [each.mean for each in points], "o-", color=color, label=method, markersize=3)
+        lows, highs = [each.low for each in points], [each.high for each in points]
+        if None not in lows:
+            axes.fill_between(steps, lows, highs, color=color, alpha=0.2, linewidth=0)  # type: ignore[arg-type]
+        else:
+            for run in runs:
+                axes.plot(steps, [point.final for point in run.curve], color=color, alpha=0.4, linewidth=0.8)
+    _draw_references(axes, results[0])
+    axes.set(xlabel="training steps", ylabel=f"return on test tasks ({protocol})", title=title)
+    axes.legend(fontsize="small")
+    figure.savefig(file, dpi=130)
+
+
+def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
+    """Final returns per protocol: a line at the mean, dots for seeds, an interval from five seeds."""
+    protocols = list(results[0].evaluations)
+    figure, panels = _panels(len(protocols))
+    methods = _by_method(results)
+    for axes, protocol in zip(panels, protocols, strict=True):
+        for place, runs in enumerate(methods.values()):
+            summary = summarize([run.evaluations[protocol]["mean_final"] for run in runs])
+            color = f"C{place % 10}"
+            axes.hlines(summary.mean, place - 0.3, place + 0.3, color=color, linewidth=3)
+            axes.plot([place] * len(runs), summary.values, ".", color="0.3", markersize=5)
+            if summary.low is not None and summary.high is not None:
+                axes.vlines(place, summary.low, summary.high, color=color, linewidth=8, alpha=0.3)
+        axes.set_xticks(range(len(methods)), list(methods), rotation=30, ha="right", fontsize="small")
+        axes.set(title=f"{title}: {protocol}", ylabel="return on test tasks", xlim=(-0.6, len(methods) - 0.4))
+    figure.savefig(file, dpi=130)
+
+
+def draw_embeddings(
+    file: Path, points: Mapping[str, FloatArray], labels: IntArray, is_test: Sequence[bool]
+) -> None:
+    """t-SNE of contexts, one panel per method and one colour per task; test tasks are triangles."""
+    figure, panels = _panels(len(points))
+    for axes, (method, places) in zip(panels, points.items(), strict=True):
+        for task, test in enumerate(is_test):
+            own = places[labels == task]
+            color = [_color(task, len(is_test))]
+            axes.scatter(own[:, 0], own[:, 1], s=14, c=color, marker="^" if test else "o")
+        axes.set(title=method, xticks=[], yticks=[])
+    figure.savefig(file, dpi=130)
+
+
+def draw_attention(file: Path, weights: Mapping[str, TransitionWeights]) -> None:
+    """Relative attention by step, mean over trajectories; and along one trajectory, beside its rewards."""
+    figure, panels = _panels(1 + len(weights))
+    mean, *examples = panels
+    for method, each in weights.items():
+        mean.plot(each.by_step, label=method)
+    mean.axhline(1.0, color="0.5", linestyle=":")
+    mean.set(xlabel="step", ylabel="weight × steps (even: 1)", title="mean over trajectories")
+    mean.legend(fontsize="small")
+    for axes, (method, each) in zip(examples, weights.items(), strict=True):
+        axes.bar(range(len(each.example)), each.example, color="C0", alpha=0.6)
+        axes.set(xlabel="step", ylabel="weight × steps", title=f"{method}: one trajectory")
+        rewards = axes.twinx()
+        rewards.plot(each.example_rewards, "C1.-", markersize=3)
+        rewards.set_ylabel("reward", color="C1")
+    figure.savefig(file, dpi=130)
+
+
+def _panels(count: int, *, width: float = WIDTH) -> "tuple[Figure, list[Axes]]":
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    columns = min(count, 3)
+    rows = -(-count // columns)
+    figure = Figure(figsize=(columns * width, rows * HEIGHT), layout="constrained")
+    FigureCanvasAgg(figure)
+    grid = list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
+    for unused in grid[count:]:
+        unused.set_visible(False)
+    for axes in grid:
+        axes.grid(alpha=0.3)
+    return figure, grid[:count]
+
+
+def _by_method(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
+    found: dict[str, list[RunResult]] = {}
+    for each in results:
+        found.setdefault(each.method, []).append(each)
+    return found
+
+
+def _draw_references(axes: "Axes", result: RunResult) -> None:
+    tasks = next(iter(result.evaluations.values()))["tasks"]
+    for name, line in (("oracle", "--"), ("random", ":")):
+        values = [task[name] for task in tasks]
+        if None not in values:
+            label = "uniform actions" if name == "random" else name
+            axes.axhline(float(np.mean(values)), color="0.3", linestyle=line, label=label)
+
+
+def _color(index: int, count: int) -> tuple[float, float, float, float]:
+    from matplotlib import colormaps
+
+    red, green, blue, alpha = colormaps["turbo"](index / max(count - 1, 1))
+    return float(red), float(green), float(blue), float(alpha)

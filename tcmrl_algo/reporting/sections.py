@@ -1,0 +1,173 @@
+"""Tables of a report, one function each; `write.py` puts them in order."""
+
+import importlib.resources
+import tomllib
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.reporting.claims import Verdict
+from tcmrl_algo.reporting.contexts import TransitionWeights
+from tcmrl_algo.reporting.tables import Cell, Table, across_seeds
+from tcmrl_data import Dataset, return_table
+
+PAPER_COSTS = ("paper: training s", "paper: MB")
+PAPER_ATTENTION = ("paper: mean", "paper: median")
+PARTS = ("final", "shuffled", "regret", "normalized")
+
+
+def by_method(results: Iterable[RunResult]) -> dict[str, list[RunResult]]:
+    """Results of every method, in the order given."""
+    found: dict[str, list[RunResult]] = {}
+    for each in results:
+        found.setdefault(each.method, []).append(each)
+    return found
+
+
+def final_table(name: str, results: Sequence[RunResult]) -> Table:
+    """Per protocol and method: return after adaptation, under others' contexts, regret, normalised score."""
+    rows: list[tuple[Cell, ...]] = []
+    for protocol in results[0].evaluations:
+        for method, runs in by_method(results).items():
+            values = {part: [run.evaluations[protocol][f"mean_{part}"] for run in runs] for part in PARTS}
+            others = (across_seeds(values[part])[0] for part in PARTS[1:])
+            rows.append((protocol, method, len(runs), *across_seeds(values["final"]), *others))
+    columns = ("protocol", "method", "seeds", "return", "IQM", "95% interval", "other context")
+    return Table(name, (*columns, "regret", "normalized"), tuple(rows))
+
+
+def curve_table(name: str, results: Sequence[RunResult]) -> Table:
+    """The learning curves' points, one row per run and step."""
+    rows = tuple(
+        (run.method, run.seed, point.step, point.final, point.regret, point.shuffled)
+        for run in results
+        for point in run.curve
+    )
+    return Table(name, ("method", "seed", "step", "return", "regret", "other context"), rows)
+
+
+def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
+    """Each claim, the mean difference with its interval or seeds, and the verdict."""
+    rows: list[tuple[Cell, ...]] = []
+    for each in verdicts:
+        mean, _, spread = across_seeds(each.differences)
+        rows.append((each.claim, each.environment, each.comparison, mean, spread, each.verdict))
+    columns = ("claim", "environment", "compared", "mean difference", "95% interval", "verdict")
+    return Table(name, columns, tuple(rows))
+
+
+def published_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
+    """Scores of the paper's Table 2 beside ours, by the method's name; None where the units differ."""
+    scores = published()["returns"].get(environment)
+    if scores is None:
+        return None
+    ours = by_method(results)
+    protocols = list(results[0].evaluations)
+    rows: list[tuple[Cell, ...]] = []
+    for method in dict.fromkeys((*scores, *ours)):
+        cells: list[Cell] = []
+        for protocol in protocols:
+            finals = [run.evaluations[protocol]["mean_final"] for run in ours.get(method, [])]
+            cells += across_seeds(finals)[::2]
+        rows.append((method, _plus_minus(scores.get(method)), *cells))
+    columns = [f"ours, {each}{part}" for each in protocols for part in ("", ": 95% interval")]
+    return Table(name, ("method", "paper, Table 2", *columns), tuple(rows))
+
+
+def cost_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
+    """Time and memory per method, beside the paper's Tables 6 and 7; None where no run was timed."""
+    if all(each.training_seconds is None for each in results):
+        return None
+    costs = published()["costs"].get(environment, {})
+    rows: list[tuple[Cell, ...]] = []
+    for method, runs in by_method(results).items():
+        training, _, spread = across_seeds([run.training_seconds for run in runs])
+        evaluation = across_seeds([run.evaluation_seconds for run in runs])[0]
+        memory = across_seeds([None if run.peak_memory is None else run.peak_memory / 1e6 for run in runs])[0]
+        pace = training / runs[0].steps * 1e3 if isinstance(training, float) else None
+        printed = costs.get(method, (None, None)) if costs else ()
+        rows.append((method, training, spread, pace, evaluation, memory, *printed))
+    columns = ("method", "training s", "95% interval", "ms per step", "evaluation s", "peak MB")
+    return Table(name, (*columns, *(PAPER_COSTS if costs else ())), tuple(rows))
+
+
+def context_table(name: str, ratios: Sequence[tuple[str, Sequence[float | None]]]) -> Table:
+    """How far contexts of one task lie apart, as a share of how far those of two tasks do."""
+    rows = tuple((method, len(values), *across_seeds(values)[::2]) for method, values in ratios)
+    return Table(name, ("method", "seeds", "within / between tasks", "95% interval"), rows)
+
+
+def attention_table(
+    name: str, environment: str, weights: Sequence[tuple[str, Sequence[TransitionWeights]]]
+) -> Table | None:
+    """Relative weights of transitions with and without reward, beside the paper's Table 5.
+
+    None where no trajectory holds both kinds.
+    """
+    printed = published()["attention"].get(environment, {})
+    rows: list[tuple[Cell, ...]] = []
+    for kind in ("nonzero", "zero"):
+        for method, runs in weights:
+            found = [getattr(each, kind) for each in runs]
+            if any(len(each) == 0 for each in found):
+                continue
+            mean, _, spread = across_seeds([float(each.mean()) for each in found])
+            median = across_seeds([float(np.median(each)) for each in found])[0]
+            rows.append((method, f"{kind} reward", mean, spread, median, *printed.get(kind, ())))
+    columns = ("method", "transitions", "mean", "95% interval", "median")
+    return Table(name, (*columns, *(PAPER_ATTENTION if printed else ())), tuple(rows)) if rows else None
+
+
+def dataset_table(name: str, dataset: Dataset) -> Table:
+    """Mean returns of the stored episodes by snapshot, over tasks (the paper's Table 8 is lost to us)."""
+    tasks = return_table(dataset)["tasks"]
+    steps = sorted({found["step"] for task in tasks for found in task["snapshots"]})
+    rows: list[tuple[Cell, ...]] = []
+    for step in (*steps, None):
+        cells = [_mean_return(tasks, split, step) for split in ("train", "test")]
+        rows.append(("all" if step is None else step, *cells))
+    return Table(name, ("snapshot", "training tasks", "test tasks"), tuple(rows))
+
+
+def setup_table(name: str, results: Sequence[RunResult]) -> Table:
+    """What the runs are a function of."""
+    values: dict[str, list[Any]] = {
+        "dataset root": [each.root for each in results],
+        "training profile": [each.profile for each in results],
+        "seeds": [each.seed for each in results],
+        "training steps": [each.steps for each in results],
+        "device": [each.device for each in results],
+        "threads per run": [each.threads for each in results],
+        "versions": [", ".join(f"{key} {value}" for key, value in each.versions.items()) for each in results],
+    }
+    rows = tuple((key, ", ".join(dict.fromkeys(map(str, found)))) for key, found in values.items())
+    return Table(name, ("what", "value"), rows)
+
+
+def digest_table(name: str, results: Sequence[RunResult]) -> Table:
+    """Digest of every run's tensors, by which a repetition compares."""
+    rows = tuple((each.method, each.seed, each.digest) for each in results)
+    return Table(name, ("method", "seed", "sha256 of all tensors"), rows)
+
+
+def published() -> dict[str, Any]:
+    """The paper's numbers that ours stand beside."""
+    file = importlib.resources.files("tcmrl_manifests") / "published.toml"
+    return tomllib.loads(file.read_text(encoding="utf-8"))
+
+
+def _mean_return(tasks: Sequence[dict[str, Any]], split: str, step: int | None) -> float | None:
+    means = [
+        found["mean"]
+        for task in tasks
+        if task["split"] == split
+        for found in task["snapshots"]
+        if step in (None, found["step"])
+    ]
+    return float(np.mean(means)) if means else None
+
+
+def _plus_minus(score: Sequence[float] | None) -> str | None:
+    return None if score is None else " ± ".join(f"{each:g}" for each in score)

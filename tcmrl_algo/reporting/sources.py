@@ -1,0 +1,157 @@
+"""What a report is on: results folders as experiments left them, and single runs gathered into one."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import get_args
+
+from tcmrl_algo.checkpoint import Run, open_run
+from tcmrl_algo.config import Protocol
+from tcmrl_algo.evaluate import evaluate_run
+from tcmrl_algo.experiment.config import Experiment, read_experiment, run_id
+from tcmrl_algo.experiment.results import RunResult, read_results
+from tcmrl_algo.train import digest
+from tcmrl_data import CheckpointError, TrainingError, canonical_json, parse_json
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A result, and the folder of the run that it came from, which may be gone.
+
+    Attributes:
+        result: the document.
+        folder: the run's, with its checkpoints.
+    """
+
+    result: RunResult
+    folder: Path
+
+
+@dataclass(frozen=True)
+class Source:
+    """One experiment and its finished runs, by environment, method and seed."""
+
+    experiment: Experiment
+    runs: tuple[FinishedRun, ...]
+
+    def environments(self) -> list[str]:
+        """Those with finished runs."""
+        return list(dict.fromkeys(each.result.environment for each in self.runs))
+
+    def of(self, environment: str) -> list[FinishedRun]:
+        """Its finished runs."""
+        return [each for each in self.runs if each.result.environment == environment]
+
+
+def read_sources(paths: Sequence[Path], report: Callable[[str, int, int], None]) -> list[Source]:
+    """Results folders in the order given, then one source of all run folders, which are evaluated here.
+
+    Raises:
+        CheckpointError: neither kind of folder, or no finished run in it.
+    """
+    sources, runs = [], []
+    for path in paths:
+        if (path / "experiment.json").is_file():
+            sources.append(_results_folder(path))
+        elif (path / "run.json").is_file():
+            runs.append(open_run(path))
+        else:
+            raise CheckpointError(
+                f"{path} has neither experiment.json nor run.json; name a folder that `tcmrl experiment` or "
+                "`tcmrl train` made"
+            )
+    if runs:
+        sources.append(_single_runs(runs, report))
+    return sources
+
+
+def _results_folder(path: Path) -> Source:
+    file = path / "experiment.json"
+    try:
+        tables = parse_json(file.read_bytes())
+    except ValueError as error:
+        raise CheckpointError(f"{file}: {error}; run `tcmrl experiment` again, which writes it") from None
+    if not isinstance(tables, dict):
+        raise TrainingError(f"{file} is no experiment; run `tcmrl experiment` again, which writes it")
+    experiment = read_experiment(tables, place=str(file))
+    found = [
+        FinishedRun(each, path / "runs" / run_id(each.environment, each.method, each.seed))
+        for each in read_results(path, experiment)
+    ]
+    if not found:
+        raise CheckpointError(f"{path} holds no finished run yet; `tcmrl experiment` goes on with them")
+    return Source(experiment, tuple(found))
+
+
+def _single_runs(runs: Sequence[Run], report: Callable[[str, int, int], None]) -> Source:
+    """Runs as if an experiment had made them; those of one algorithm count as seeds of one method."""
+    labels = _labels(runs)
+    experiment = read_experiment(
+        {
+            "schema": 1,
+            "name": "runs",
+            "title": "Single runs",
+            "source": "none",
+            "seeds": sorted({run.record.seed for run in runs}),
+            "environments": {run.record.environment: {} for run in runs},
+            "methods": {
+                label: {"algorithm": run.record.config.settings.run.algorithm}
+                for label, run in zip(labels, runs, strict=True)
+            },
+        },
+        place="the run folders",
+    )
+    found = []
+    for done, (label, run) in enumerate(zip(labels, runs, strict=True)):
+        report("evaluating", done, len(runs))
+        found.append(FinishedRun(_evaluated(label, run), run.folder))
+    report("evaluating", len(runs), len(runs))
+    order = list(experiment.methods)
+    key = [(each.result.environment, order.index(each.result.method), each.result.seed) for each in found]
+    return Source(
+        experiment, tuple(each for _, each in sorted(zip(key, found, strict=True), key=lambda x: x[0]))
+    )
+
+
+def _labels(runs: Sequence[Run]) -> list[str]:
+    """The algorithm where seeds alone tell its runs apart, else the folder's name too."""
+    kinds: dict[str, set[bytes]] = {}
+    places: dict[str, list[tuple[str, int]]] = {}
+    for run in runs:
+        name = run.record.config.settings.run.algorithm
+        kinds.setdefault(name, set()).add(canonical_json(run.record.config.model_dump(mode="json")))
+        places.setdefault(name, []).append((run.record.environment, run.record.seed))
+    names = [run.record.config.settings.run.algorithm for run in runs]
+    return [
+        name
+        if len(kinds[name]) == 1 and len(set(places[name])) == len(places[name])
+        else f"{name} {run.folder.name}"
+        for name, run in zip(names, runs, strict=True)
+    ]
+
+
+def _evaluated(label: str, run: Run) -> RunResult:
+    record = run.record
+    documents = {each: evaluate_run(run.folder, protocol=each).to_json() for each in get_args(Protocol)}
+    return RunResult(
+        experiment="runs",
+        method=label,
+        algorithm=record.config.settings.run.algorithm,
+        environment=record.environment,
+        seed=record.seed,
+        profile=record.profile,
+        dataset=record.dataset,
+        root=record.root,
+        steps=run.newest().step,
+        device=record.device,
+        threads=record.config.settings.run.threads,
+        identity={},
+        config=record.config,
+        versions=record.versions,
+        digest=digest(run.newest().tensors()),
+        curve=(),
+        evaluations=documents,
+        training_seconds=None,
+        evaluation_seconds=None,
+        peak_memory=None,
+    )

@@ -1,0 +1,234 @@
+"""Experiments: files, plans, runs in a results folder, resuming, and `tcmrl experiment`."""
+
+import csv
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tcmrl_cli.train import tcmrl
+
+import tcmrl_data
+from tcmrl_algo import experiment_names, load_experiment, open_run, resolve, run_experiment, train_run
+from tcmrl_algo.experiment.config import Experiment, override_texts, read_experiment
+from tcmrl_algo.experiment.driver import Finished
+from tcmrl_algo.experiment.results import RunResult, read_record
+from tcmrl_data import TcmrlError, TrainingError
+from tests import experiments
+from tests.commands import Call, assert_refused, in_process
+from tests.workers import ROOT, marked_pids, wait_for
+
+FILES = {f"point-robot--{method}--seed{seed}" for method in ("tcmrl", "no-context") for seed in (0, 1)}
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Call:
+    return in_process(tcmrl, capsys)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
+    """The results folder of the small experiment, run once."""
+    out = tmp_path_factory.mktemp("results") / "small"
+    events: list[Finished] = []
+    report = run_experiment(_small(tiny_folder), out, workers=2, report=events.append)
+    assert (report.present, report.failed, len(report.results)) == (0, (), 4)
+    assert [(each.done, each.total) for each in events] == [(done, 4) for done in (1, 2, 3, 4)]
+    assert events[-1].seconds_left == 0
+    return out
+
+
+def _small(dataset: Path, **changes: Any) -> Experiment:
+    return read_experiment(experiments.tables(dataset, **changes), place="test")
+
+
+def test_one_document_per_run_and_one_table(finished: Path, tiny_folder: Path) -> None:
+    assert {each.stem for each in finished.glob("runs/*.json")} == FILES
+    result = read_record(RunResult, finished / "runs/point-robot--tcmrl--seed1.json")
+    run = open_run(finished / "runs/point-robot--tcmrl--seed1")
+    assert result.root == tcmrl_data.open_dataset(tiny_folder).manifest.root
+    assert (result.method, result.seed, result.steps) == ("TCMRL", 1, 40)
+    assert result.config == run.record.config
+    assert result.config.method["latent"] == 4
+    assert [each.step for each in result.curve] == [20, 40]
+    assert sum(each.timed_steps for each in result.curve) == 40
+    assert list(result.evaluations) == ["offline", "paper"]
+    assert result.evaluations["offline"]["mean_final"] == result.curve[-1].final
+    assert result.training_seconds is not None and result.training_seconds > 0
+    assert result.peak_memory is not None and result.peak_memory > 50e6
+    assert result.threads == result.config.settings.run.threads == max(1, len(os.sched_getaffinity(0)) // 2)
+    assert {"torch", "tcmrl"} <= set(result.versions)
+    rows = list(csv.DictReader((finished / "table.csv").read_text().splitlines()))
+    assert [row["method"] for row in rows] == ["TCMRL"] * 4 + ["no context"] * 4
+    assert float(rows[2]["final"]) == result.evaluations["offline"]["mean_final"]
+
+
+def test_a_second_call_does_nothing_and_says_the_same(
+    finished: Path, tiny_folder: Path, tmp_path: Path, call: Call
+) -> None:
+    file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
+    before = {each: each.stat().st_mtime_ns for each in finished.glob("runs/*.json")}
+    code, output, errors = call("experiment", file, "--out", finished, "--json")
+    document = json.loads(output)
+    assert (code, errors) == (0, "")
+    assert (document["ran"], document["present"], document["failed"]) == (0, 4, [])
+    assert len(document["rows"]) == 8
+    assert {each: each.stat().st_mtime_ns for each in finished.glob("runs/*.json")} == before
+    code, output, errors = call("experiment", file, "--out", finished)
+    assert "TCMRL" in output and "0 runs done, 4 were there" in output
+
+
+def test_other_settings_or_data_are_refused_by_name(
+    finished: Path, tiny_folder: Path, tiny_copy: Callable[[], Path], tmp_path: Path, call: Call
+) -> None:
+    file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
+    assert_refused(call("experiment", file, "--out", finished, "--steps", 80), "run.steps 40", "80", "--out")
+    changed = experiments.tables(tiny_folder, curve_points=4)
+    file = experiments.write_file(tmp_path / "curve.toml", changed)
+    assert_refused(call("experiment", file, "--out", finished), "curve_points 2", "4")
+    result = finished / "runs/point-robot--tcmrl--seed0.json"
+    record = read_record(RunResult, result)
+    other = finished.parent / "other"
+    (other / "runs").mkdir(parents=True)
+    forged = record.model_copy(update={"identity": record.identity | {"root": "0" * 64}})
+    (other / "runs" / result.name).write_text(forged.model_dump_json())
+    with pytest.raises(TcmrlError, match="root '000"):
+        run_experiment(_small(tiny_folder), other)
+
+
+def test_only_and_seeds_choose_runs_and_the_table_keeps_the_rest(
+    finished: Path, tiny_folder: Path, tmp_path: Path, call: Call
+) -> None:
+    file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
+    arguments = ["--only", "TCMRL", "--seeds", "1", "--json"]
+    code, output, _ = call("experiment", file, "--out", finished, *arguments)
+    assert (code, json.loads(output)["present"]) == (0, 1)
+    assert len((finished / "table.csv").read_text().splitlines()) == 9
+    assert_refused(call("experiment", file, "--only", "TCMLR"), "'TCMLR'", "'no context'")
+    assert_refused(call("experiment", file, "--seeds", "1-x"), "--seeds", "1-x")
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"sedes": [0]}, ["sedes"]),
+        ({"seeds": [0, 0]}, ["seeds", "distinct"]),
+        ({"seeds": []}, ["seeds"]),
+        ({"protocols": ["ofline"]}, ["protocols", "ofline"]),
+        ({"name": "../up"}, ["name"]),
+        ({"schema": 2}, ["schema"]),
+        ({"curve_points": 41}, ["41", "40"]),
+        ({"methods": {"A": {"algorithm": "tcmlr"}}, "claims": []}, ["tcmlr", "tcmrl"]),
+        ({"methods": {"A": {"algorithm": "tcmrl"}}}, ["claim", "'TCMRL'", "'A'"]),
+        ({"methods": {"A b": {"algorithm": "tcmrl"}, "A-B": {"algorithm": "tcmrl"}}}, ["methods", "a-b"]),
+        ({"training": {"tcmrl": {"latnet": 3}}}, ["latnet", "'TCMRL'"]),
+        ({"training": {"run": {"steps": "many"}}}, ["steps", "many"]),
+        (
+            {"environments": {"point-robot": {"dataset": "nowhere"}}},
+            ["nowhere", "tcmrl-data build point-robot"],
+        ),
+        ({"environments": {"point-robot": {"profile": "fast"}}}, ["fast", "quick"]),
+        ({"environments": {"half-cheetah-vel": {}}}, ["half-cheetah-vel"]),
+    ],
+    ids=str,
+)
+def test_a_bad_file_is_refused_before_anything_starts(
+    changes: dict[str, Any], expected: list[str], tiny_folder: Path, tmp_path: Path, call: Call
+) -> None:
+    content = experiments.tables(tiny_folder, **changes)
+    for choice in content["environments"].values():
+        choice.setdefault("dataset", str(tiny_folder))
+    file = experiments.write_file(tmp_path / "bad.toml", content)
+    assert_refused(call("experiment", file, "--out", tmp_path / "out"), *expected)
+    assert not (tmp_path / "out").exists()
+
+
+def test_unknown_names_and_broken_files_are_refused(tmp_path: Path, call: Call) -> None:
+    assert_refused(call("experiment", "figure55"), "figure55", "figure5")
+    assert_refused(call("experiment", tmp_path / "none.toml"), "none.toml")
+    (tmp_path / "broken.toml").write_text("name = ")
+    assert_refused(call("experiment", tmp_path / "broken.toml"), "no TOML")
+
+
+@pytest.mark.parametrize("name", experiment_names())
+def test_every_shipped_experiment_resolves_on_the_recipes_of_its_environments(name: str) -> None:
+    experiment = load_experiment(name)
+    assert experiment.name == name
+    assert len(experiment.seeds) >= 5
+    for environment, choice in experiment.environments.items():
+        tables = dict(tcmrl_data.load_recipe(environment).training)
+        table = tables[choice.profile or "paper"]  # type: ignore[index]
+        for label, method in experiment.methods.items():
+            texts = [
+                text
+                for each in (experiment.training, choice.training, method.training)
+                for text in override_texts(each)
+            ]
+            config = resolve(table, place=f"{name}, {label}", algorithm=method.algorithm, overrides=texts)
+            assert config.settings.run.steps >= experiment.curve_points
+
+
+def test_no_two_methods_of_a_shipped_experiment_are_the_same() -> None:
+    for name in experiment_names():
+        experiment = load_experiment(name)
+        kinds = [json.dumps(each.model_dump(), sort_keys=True) for each in experiment.methods.values()]
+        assert len(set(kinds)) == len(kinds), name
+
+
+def test_a_failed_run_is_told_and_tried_again(tiny_folder: Path, tmp_path: Path, call: Call) -> None:
+    content = experiments.tables(tiny_folder, seeds=[0])
+    content["methods"] |= {
+        "broken": {"algorithm": "tcmrl", "training": {"run": {"snapshots": "steps>=9999"}}}
+    }
+    file = experiments.write_file(tmp_path / "small.toml", content)
+    arguments = ["experiment", file, "--out", tmp_path / "out", "--only", "broken"]
+    code, _, errors = call(*arguments)
+    assert code == 1
+    assert "9999" in errors and "tries again" in errors
+    assert not list((tmp_path / "out").glob("runs/*.json"))
+    assert call(*arguments, "--quiet")[0] == 1
+
+
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
+    end: signal.Signals, tiny_folder: Path, tmp_path: Path, mark: str
+) -> None:
+    content = experiments.tables(tiny_folder)
+    content["training"] = content["training"] | {"run": content["training"]["run"] | {"steps": 200}}
+    file = experiments.write_file(tmp_path / "small.toml", content)
+    out = tmp_path / "out"
+    arguments = ["experiment", str(file), "--out", str(out), "--only", "TCMRL", "--seeds", "1"]
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
+    code += "; from tcmrl_cli.train import main; main()"
+    before = set(marked_pids(mark))
+    folder = out / "runs/point-robot--tcmrl--seed1"
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *arguments], cwd=ROOT, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            wait_for(lambda: list(folder.glob("checkpoints/step_*")), "a first checkpoint")
+            process.send_signal(end)
+            _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    wait_for(lambda: set(marked_pids(mark)) <= before, "the end of all workers")
+    assert process.returncode == (1 if end == signal.SIGINT else -signal.SIGKILL)
+    assert ("to go on run" in errors) == (end == signal.SIGINT)
+    assert not folder.with_name(f"{folder.name}.json").exists()
+    assert open_run(folder).newest().step < 200
+    experiment = read_experiment(content, place="test")
+    (resumed,) = run_experiment(experiment, out, only=["TCMRL"], seeds=[1]).results
+    dataset = tcmrl_data.open_dataset(tiny_folder)
+    straight = train_run(dataset, tmp_path / "straight", config=resumed.config, profile="quick", seed=1)
+    assert resumed.digest == straight.digest
+    assert [each.step for each in resumed.curve] == [100, 200]
+
+
+def test_a_missing_experiment_attribute_is_named() -> None:
+    with pytest.raises(TrainingError, match="title"):
+        read_experiment({"schema": 1, "name": "x"}, place="here")

@@ -1,0 +1,275 @@
+"""Reports: verdicts, contexts, attention, tables, and `tcmrl report` on real small runs."""
+
+import csv
+import json
+import math
+import re
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from tcmrl_cli.train import tcmrl
+
+import tcmrl_data
+from tcmrl_algo import Report, open_run, run_experiment, write_report
+from tcmrl_algo.experiment.config import Claim, read_experiment
+from tcmrl_algo.experiment.results import RunResult, read_record
+from tcmrl_algo.reporting.claims import Verdict, judge, measure_result
+from tcmrl_algo.reporting.contexts import Stored, TrainedContexts, distance_ratio, embed
+from tcmrl_algo.reporting.sections import attention_table, final_table, published, published_table
+from tcmrl_algo.reporting.sources import FinishedRun, read_sources
+from tcmrl_algo.reporting.tables import Table, across_seeds
+from tcmrl_data import Dataset
+from tests import experiments
+from tests.commands import Call, assert_refused, in_process
+
+PNG = b"\x89PNG"
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Call:
+    return in_process(tcmrl, capsys)
+
+
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
+    """The results folder of the small experiment under one seed."""
+    out = tmp_path_factory.mktemp("results") / "small"
+    experiment = read_experiment(experiments.tables(tiny_folder, seeds=[0]), place="test")
+    assert run_experiment(experiment, out, workers=2).failed == ()
+    return out
+
+
+@pytest.fixture(scope="module")
+def report(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Report:
+    return write_report([results], tmp_path_factory.mktemp("report"))
+
+
+@pytest.fixture(scope="module")
+def trained(results: Path) -> FinishedRun:
+    """The finished run of TCMRL."""
+    folder = results / "runs/point-robot--tcmrl--seed0"
+    return FinishedRun(read_record(RunResult, folder.with_name(f"{folder.name}.json")), folder)
+
+
+def _with_finals(run: FinishedRun, method: str, finals: list[float]) -> list[FinishedRun]:
+    """Copies of a run as if it had been done under several seeds, with these returns."""
+    document = run.result.evaluations["offline"]
+    return [
+        replace(
+            run,
+            result=run.result.model_copy(
+                update={
+                    "method": method,
+                    "seed": seed,
+                    "evaluations": {"offline": document | {"mean_final": final, "mean_regret": -final}},
+                }
+            ),
+        )
+        for seed, final in enumerate(finals)
+    ]
+
+
+def _judge(claim: Claim, runs: list[FinishedRun]) -> Verdict:
+    return judge(
+        claim,
+        "point-robot",
+        runs,
+        protocol="offline",
+        measure=lambda run, metric, protocol: measure_result(run.result, metric, protocol),
+    )
+
+
+@pytest.mark.parametrize(
+    ("better", "worse", "metric", "verdict"),
+    [
+        ([2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 2.0, 3.0, 4.0, 5.0], "final", "supported"),
+        ([1.0, 2.0, 3.0, 4.0, 5.0], [2.0, 3.0, 4.0, 5.0, 6.0], "final", "contradicted"),
+        ([1.0, 5.0, 1.0, 5.0, 1.0], [5.0, 1.0, 5.0, 1.0, 1.0], "final", "cannot tell"),
+        ([9.0, 9.0, 9.0, 9.0], [1.0, 1.0, 1.0, 1.0], "final", "cannot tell"),  # too few seeds
+        ([2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 2.0, 3.0, 4.0, 5.0], "regret", "supported"),  # lower is better
+    ],
+)
+def test_a_verdict_follows_from_paired_differences(
+    trained: FinishedRun, better: list[float], worse: list[float], metric: str, verdict: str
+) -> None:
+    claim = Claim(text="A beats B", better="A", worse="B", metric=metric)  # type: ignore[arg-type]
+    runs = [*_with_finals(trained, "A", better), *_with_finals(trained, "B", worse)]
+    found = _judge(claim, runs)
+    assert found.verdict == verdict
+    assert found.differences == tuple(a - b for a, b in zip(better, worse, strict=True))
+
+
+def test_differences_are_paired_by_seed_and_large_common_noise_cancels(trained: FinishedRun) -> None:
+    noise = [-100.0, 50.0, 3.0, 77.0, -20.0]
+    better = _with_finals(trained, "A", [each + 1.0 for each in noise])
+    worse = _with_finals(trained, "B", noise)
+    found = _judge(Claim(text="", better="A", worse="B"), [*better, *worse[::-1]])
+    assert (found.verdict, found.low, found.high) == ("supported", 1.0, 1.0)
+    found = _judge(Claim(text="", better="A", worse="B"), [*better[:4], *worse[1:]])
+    assert found.seeds == (1, 2, 3)
+
+
+def test_one_method_under_two_metrics_makes_a_claim(trained: FinishedRun) -> None:
+    claim = Claim(text="", better="TCMRL", worse="TCMRL", against="shuffled")
+    means = trained.result.evaluations["offline"]
+    assert _judge(claim, [trained]).differences == (means["mean_final"] - means["mean_shuffled"],)
+
+
+def test_contexts_within_a_task_over_contexts_between_tasks() -> None:
+    contexts = np.array([[0.0, 0.0], [0.0, 1.0], [3.0, 0.0], [3.0, 1.0]])
+    between = (3.0 + math.sqrt(10.0)) / 2
+    assert distance_ratio(contexts, np.array([0, 0, 1, 1])) == pytest.approx(1.0 / between)
+    assert distance_ratio(contexts, np.array([0, 0, 0, 0])) is None
+    assert distance_ratio(np.zeros((4, 2)), np.array([0, 0, 1, 1])) is None
+
+
+def test_tsne_keeps_far_groups_apart_and_repeats_itself() -> None:
+    random = np.random.default_rng(0)
+    groups = np.repeat([[0.0], [50.0]], 20, axis=0) + random.normal(size=(40, 3))
+    points = embed(groups.astype(np.float32))
+    assert points.shape == (40, 2)
+    first, second = points[:20], points[20:]
+    apart = np.linalg.norm(first.mean(axis=0) - second.mean(axis=0))
+    assert apart > 2 * max(first.std(), second.std())
+    assert np.array_equal(points, embed(groups.astype(np.float32)))
+
+
+def test_attention_is_relative_and_makes_the_context(trained: FinishedRun, tiny: Dataset) -> None:
+    stored = Stored(tiny, "all")
+    assert stored.labels.shape == (len(stored.lanes),)
+    found = TrainedContexts(trained, stored)
+    weights = found.weights
+    assert weights is not None
+    assert np.mean(weights.by_step) == pytest.approx(1.0, abs=1e-5)
+    assert weights.example.sum() == pytest.approx(len(weights.example), abs=1e-4)
+    assert (len(weights.zero), len(weights.nonzero)) == (0, 0)  # no dense reward is zero
+    assert attention_table("a", "point-robot", [("TCMRL", [weights])]) is None
+    assert found.contexts is not None and found.contexts.shape == (len(stored.lanes), 4)
+
+
+def test_weights_of_rewarded_transitions_are_told_apart(trained: FinishedRun, tiny: Dataset) -> None:
+    stored = Stored(tiny, "all")
+    trajectory = stored.trajectories[0][0]
+    rewards = np.zeros(len(trajectory), dtype=np.float32)
+    rewards[3] = 1.0
+    stored.tasks = stored.tasks[:2]
+    stored.trajectories = [[replace(trajectory, rewards=rewards)], [trajectory]]
+    weights = TrainedContexts(trained, stored).weights
+    assert weights is not None
+    assert (len(weights.zero), len(weights.nonzero)) == (len(trajectory) - 1, 1)
+    total = weights.zero.sum() + weights.nonzero.sum()
+    assert total == pytest.approx(len(trajectory), abs=1e-4)
+    table = attention_table("a", "sparse-point-robot", [("TCMRL", [weights])])
+    assert table is not None
+    assert [row[1] for row in table.rows] == ["nonzero reward", "zero reward"]
+    assert table.rows[0][-2:] == (0.0009839126, 0.0009260265)
+
+
+def test_intervals_need_five_seeds() -> None:
+    assert across_seeds([1.0, 2.0]) == (1.5, 1.5, "seeds: 1, 2")
+    mean, iqm, spread = across_seeds([1.0, 1.0, 1.0, 1.0, 6.0])
+    assert (mean, iqm) == (2.0, 1.0)
+    assert re.fullmatch(r"1 to \d.*", str(spread))
+    assert across_seeds([1.0, None]) == (None, None, None)
+
+
+def test_tables_are_markdown_and_csv() -> None:
+    table = Table("t", ("a|b", "c"), (("x|y", 1.23456), (None, 12345.6)))
+    assert table.markdown().splitlines() == [
+        "| a\\|b | c |",
+        "| --- | --- |",
+        "| x\\|y | 1.235 |",
+        "| – | 12,346 |",
+    ]
+    assert list(csv.reader(table.csv().splitlines())) == [["a|b", "c"], ["x|y", "1.23456"], ["", "12345.6"]]
+
+
+def test_the_paper_stands_beside_ours_where_the_unit_is_the_same(trained: FinishedRun) -> None:
+    assert published_table("p", "point-robot", [trained.result]) is None
+    assert published_table("p", "ml1/reach", [trained.result]) is None
+    table = published_table("p", "half-cheetah-vel", [trained.result])
+    assert table is not None
+    rows = {row[0]: row for row in table.rows}
+    assert rows["TCMRL"][1] == "-79.7 ± 11.3"
+    assert rows["TCMRL"][2] == trained.result.evaluations["offline"]["mean_final"]
+    assert rows["IDAQ"][2:] == (None,) * (len(table.columns) - 2)
+    assert set(published()["returns"]) <= {each["name"] for each in tcmrl_data.list_environments()}
+
+
+def test_a_report_holds_every_section_and_every_file_it_names(report: Report, results: Path) -> None:
+    text = report.report.read_text()
+    for heading in ("Claims", "Learning curves", "Time and memory", "Contexts", "Attention", "Digests"):
+        assert f"# {heading}" in text
+    assert set(re.findall(r"\]\((.+?)\)", text)) == {
+        each.name for each in report.files if each.suffix == ".png"
+    }
+    assert {each.name for each in report.report.parent.iterdir()} == {each.name for each in report.files}
+    for file in report.files:
+        assert file.stat().st_size > 0
+        if file.suffix == ".png":
+            assert file.read_bytes().startswith(PNG)
+    result = read_record(RunResult, results / "runs/point-robot--tcmrl--seed0.json")
+    assert result.root in text and result.digest in text
+    table = final_table("x", [result])
+    assert f"{table.rows[0][3]:.4g}" in text
+    assert [each.verdict for each in report.verdicts] == ["cannot tell"] * 2
+
+
+def test_dataset_returns_are_those_of_its_parts(report: Report, tiny: Dataset) -> None:
+    (file,) = (each for each in report.files if each.name.endswith("-dataset.csv"))
+    rows = {row["snapshot"]: row for row in csv.DictReader(file.read_text().splitlines())}
+    means = [tiny.part(task.index, 150).statistics.mean for task in tiny.train_tasks]
+    assert float(rows["150"]["training tasks"]) == pytest.approx(np.mean(means))
+    assert list(rows) == ["0", "100", "150", "all"]
+
+
+def test_the_command_writes_reports_on_results_and_on_runs(results: Path, tmp_path: Path, call: Call) -> None:
+    run = results / "runs/point-robot--tcmrl--seed0"
+    code, output, _ = call("report", run, "--out", tmp_path / "runs", "--json", "--quiet")
+    document = json.loads(output)
+    assert code == 0
+    assert document["report"] == str(tmp_path / "runs/report.md")
+    text = (tmp_path / "runs/report.md").read_text()
+    assert "Single runs" in text and "| idaq | tcmrl | 1 |" in text
+    assert "Learning curves" not in text
+
+
+def test_a_report_without_checkpoints_says_what_is_left_out(
+    results: Path, tmp_path: Path, call: Call
+) -> None:
+    copy = tmp_path / "copy"
+    (copy / "runs").mkdir(parents=True)
+    shutil.copy(results / "experiment.json", copy)
+    for file in results.glob("runs/*.json"):
+        shutil.copy(file, copy / "runs")
+    code, output, _ = call("report", copy)
+    assert code == 0
+    assert "cannot tell: TCMRL ends higher (point-robot)" in output
+    text = (copy / "report/report.md").read_text()
+    assert "are left out: " in text and "is no run" in text and "Time and memory" in text
+
+
+def test_what_is_no_run_is_refused(results: Path, tmp_path: Path, call: Call) -> None:
+    assert_refused(call("report", tmp_path), "experiment.json", "run.json")
+    shutil.copy(results / "experiment.json", tmp_path)
+    assert_refused(call("report", tmp_path), "no finished run")
+    (tmp_path / "experiment.json").write_text("{")
+    assert_refused(call("report", tmp_path), "experiment.json")
+
+
+def test_runs_of_one_algorithm_with_other_settings_are_told_apart(results: Path, tmp_path: Path) -> None:
+    first = results / "runs/point-robot--tcmrl--seed0"
+    other = tmp_path / "other"
+    shutil.copytree(first, other)
+    record = json.loads((other / "run.json").read_text())
+    record["config"]["settings"]["run"]["episodes"] = 3
+    (other / "run.json").write_text(json.dumps(record))
+    (source,) = read_sources([first, other], lambda stage, done, total: None)
+    assert list(source.experiment.methods) == [f"tcmrl {first.name}", "tcmrl other"]
+    torch.testing.assert_close(
+        open_run(first).newest().tensors(), open_run(other).newest().tensors(), rtol=0, atol=0
+    )
