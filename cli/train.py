@@ -1,4 +1,4 @@
-"""`tcmrl`: meta-train on a dataset's manifest, and meta-test a run."""
+"""`tcmrl` and its first command: meta-train on a dataset's manifest."""
 
 import sys
 from collections.abc import Sequence
@@ -7,18 +7,17 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import click
 
+from .evaluation import evaluate
 from .experiments import experiment
-from .frame import duration, output_options, print_json, print_table, remark, run
+from .frame import duration, output_options, print_json, remark, run
 from .progress import StageProgress
 from .reports import report
-from .scores import EXPLANATION, score_table
 
 if TYPE_CHECKING:
     from tcmrl_algo import Progress, TrainingReport
     from tcmrl_data import Dataset
 
 Profile = Literal["paper", "quick", "reduced"]
-Protocol = Literal["paper", "offline", "idaq"]
 
 
 def main() -> None:
@@ -43,6 +42,7 @@ def tcmrl() -> None:
     """
 
 
+tcmrl.add_command(evaluate)
 tcmrl.add_command(experiment)
 tcmrl.add_command(report)
 
@@ -159,7 +159,10 @@ def _train(
 ) -> "TrainingReport":
     from tcmrl_algo import resolve, train_run
 
-    table = dataset.manifest.training[profile]
+    table = dataset.manifest.training.get(profile)
+    if table is None:
+        known = ", ".join(dataset.manifest.training)
+        raise click.UsageError(f"{dataset.folder} has no training table {profile!r}; known are {known}.")
     place = f"training table of {dataset.name!r}, profile {profile!r}"
     config = resolve(table, place=place, algorithm=algo, overrides=overrides)
     return train_run(
@@ -247,64 +250,3 @@ def _print_training(report: "TrainingReport", *, as_json: bool, quiet: bool) -> 
         f"{report.step:,} steps in {duration(report.seconds)}, tensors {report.digest[:12]}"
     )
     remark(f"Next: tcmrl evaluate {report.run.folder}", quiet=quiet)
-
-
-@tcmrl.command()
-@click.argument("run_folder", metavar="RUN", type=click.Path(path_type=Path))
-@click.option(
-    "--protocol",
-    type=click.Choice([*get_args(Protocol), "all"]),
-    help="How to adapt; the recipe's choice if left out. `all` runs the three and compares them.",
-)
-@click.option(
-    "--dataset",
-    type=click.Path(path_type=Path),
-    help="The dataset the run was trained on, if it has moved.",
-)
-@click.option(
-    "--episodes", type=click.IntRange(min=1), help="Adaptation episodes per task; the recipe's if left out."
-)
-@output_options
-def evaluate(
-    run_folder: Path,
-    protocol: Protocol | Literal["all"] | None,
-    dataset: Path | None,
-    episodes: int | None,
-    as_json: bool,
-    quiet: bool,
-) -> None:
-    """Adapt the policy in RUN to the test tasks, and score it beside its controls.
-
-    \b
-    paper    uniform actions first, then the policy, its context growing by episode
-    offline  contexts from the test tasks' stored trajectories
-    idaq     contexts of training tasks first; the best-return episode's is kept
-
-    Controls: uniform actions, the oracle, and other tasks' contexts. Returns are undiscounted.
-    With --protocol all, --json prints a list of the three documents.
-
-    \b
-    Examples:
-      tcmrl evaluate runs/point-robot-tcmrl-seed0
-      tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all --json
-    """
-    from tcmrl_algo import evaluate_run
-
-    chosen: Sequence[Protocol | None] = get_args(Protocol) if protocol == "all" else [protocol]
-    results = []
-    with StageProgress(quiet=quiet) as progress:
-        for each in chosen:
-            label = f"{each} " if each else ""
-
-            def show(stage: str, done: int, total: int, label: str = label) -> None:
-                progress.update(label + stage, done=done, total=total, unit="episodes")
-
-            results.append(
-                evaluate_run(run_folder, protocol=each, dataset_path=dataset, episodes=episodes, report=show)
-            )
-    if as_json:
-        documents = [each.to_json() for each in results]
-        print_json(documents if protocol == "all" else documents[0])
-        return
-    print_table(score_table(results))
-    remark(EXPLANATION, quiet=quiet)
