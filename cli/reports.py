@@ -39,7 +39,7 @@ def report(runs: tuple[Path, ...], out: Path | None, as_json: bool, quiet: bool)
         written = write_report(
             runs,
             out or runs[0] / "report",
-            report=lambda stage, done, total: progress.update(stage, done=done, total=total, unit="runs"),
+            report=lambda stage, done, total: progress.update(stage, done=done, total=total, unit="parts"),
         )
     if as_json:
         document = dataclasses.asdict(written)

@@ -97,7 +97,7 @@ def write_report(paths: Sequence[str | Path], out: str | Path, *, report: Progre
     Args:
         paths: the folders; all run folders together make one section.
         out: folder of the report, made here; files of an earlier report are replaced.
-        report: called with a stage, runs done and runs to do.
+        report: called with a stage, and how much of it is done and to do.
 
     Raises:
         CheckpointError: a folder is of neither kind, or holds nothing finished.
@@ -124,18 +124,20 @@ def _write_source(page: Page, source: Source, name: str, trained: Trained, repor
     experiment = source.experiment
     page.text(f"## {experiment.title}")
     page.text(f"Experiment `{experiment.name}`; the paper's counterpart: {experiment.source}.")
-    verdicts = _verdicts(source, trained, report)
+    verdicts = _verdicts(source, trained)
     if verdicts:
         page.text("### Claims")
         page.text(CLAIMS)
         page.table(sections.verdict_table(f"{name}-claims", verdicts))
-    for environment in source.environments():
+    environments = source.environments()
+    for done, environment in enumerate(environments, start=1):
         runs = source.of(environment)
         _write_environment(page, f"{name}-{folder_name(environment)}", environment, runs, trained)
+        report(f"report on {name}", done, len(environments))
     return verdicts
 
 
-def _verdicts(source: Source, trained: Trained, report: Progress) -> list[Verdict]:
+def _verdicts(source: Source, trained: Trained) -> list[Verdict]:
     def measure(run: FinishedRun, metric: Metric, protocol: str) -> float | None:
         if metric not in ("attention_zero", "attention_nonzero"):
             return measure_result(run.result, metric, protocol)
@@ -146,13 +148,12 @@ def _verdicts(source: Source, trained: Trained, report: Progress) -> list[Verdic
         found = getattr(weights, metric.removeprefix("attention_"), np.empty(0))
         return float(found.mean()) if len(found) else None
 
-    claims, verdicts = source.experiment.claims, []
-    for done, claim in enumerate(claims):
-        report("judging claims", done, len(claims))
-        for environment in source.environments():
-            runs, protocol = source.of(environment), source.experiment.protocols[0]
-            verdicts.append(judge(claim, environment, runs, protocol=protocol, measure=measure))
-    return verdicts
+    protocol = source.experiment.protocols[0]
+    return [
+        judge(claim, environment, source.of(environment), protocol=protocol, measure=measure)
+        for claim in source.experiment.claims
+        for environment in source.environments()
+    ]
 
 
 def _write_environment(
