@@ -266,7 +266,14 @@ def test_no_task_parameter_is_reachable_from_a_batch(sampler: Sampler) -> None:
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device on this machine")
-def test_batches_on_a_device_equal_those_on_the_cpu(tiny: Dataset) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.5], ids=["copied", "on the device"])
+def test_batches_on_a_device_equal_those_on_the_cpu(
+    tiny: Dataset, share: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tcmrl_data.gather.DEVICE_SHARE", share)
     selection = tiny.select(split="train")
-    left, right = (selection.sampler(SIZES, seed=1, device=name).batch(5) for name in ("cpu", "cuda"))
-    assert all(torch.equal(a, b.cpu()) for a, b in zip(leaves(left), leaves(right), strict=True))
+    left, right = (selection.sampler(SIZES, seed=1, device=name) for name in ("cpu", "cuda"))
+    with right.prefetch(0, 20) as batches:
+        for n, batch in enumerate(batches):
+            pairs = zip(leaves(left.batch(n)), leaves(batch), strict=True)
+            assert all(torch.equal(a, b.cpu()) for a, b in pairs)
