@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Protocol, final
+from typing import Protocol, final, runtime_checkable
 
 import torch
 
@@ -10,6 +10,7 @@ from tcmrl_algo.config import ALGORITHMS, TrainingConfig
 from tcmrl_data import Batch, BatchSizes, Dataset, Moments, Sampler, plugin
 
 
+@runtime_checkable
 class Batches(Protocol):
     """A stream of batches; `Sampler` is one."""
 
