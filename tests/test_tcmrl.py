@@ -197,7 +197,7 @@ def test_a_term_of_weight_zero_is_gone_and_the_others_stay(name: str) -> None:
         ({"temperature": 2.0}, {"loss/contrastive"}),
         ({"reward_estimation": "trajectory"}, {"loss/positive", "loss/negative"}),
     ],
-    ids=str,
+    ids=lambda each: "-".join(map(str, each.items() if isinstance(each, dict) else sorted(each))),
 )
 def test_a_switch_changes_its_own_terms_and_nothing_else(change: dict[str, Any], changed: set[str]) -> None:
     first, second = losses_of(learner()), losses_of(learner(change))
