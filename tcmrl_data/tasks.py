@@ -106,6 +106,6 @@ def parse_indices(text: str, num_tasks: int, *, option: str = "--tasks") -> list
         if stop < start:
             raise TaskError(f"{option} {text!r}: the range {item!r} runs backwards")
         if stop >= num_tasks:
-            raise TaskError(f"{option} {text!r}: {stop} is too large, the last one is {num_tasks - 1}")
+            raise TaskError(f"{option} {text!r}: {stop} is too large, 0-{num_tasks - 1} are possible")
         indices.update(range(start, stop + 1))
     return sorted(indices)
