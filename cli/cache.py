@@ -14,6 +14,11 @@ def cache() -> None:
 
     It lies in TCMRL_CACHE, or else in tcmrl below the user's cache folder, and takes at most
     TCMRL_CACHE_LIMIT (100G if not set); what was used longest ago goes first.
+
+    \b
+    Examples:
+      tcmrl-data cache list
+      tcmrl-data cache clear
     """
 
 

@@ -22,6 +22,9 @@ DEVICE_SHARE = 0.5
 _Field = tuple[tuple[int, ...], tuple[int, ...], int]
 """Size, strides and offset of a view."""
 
+_Fields = tuple[list[_Field], Tensor]
+"""The fields of steps in their order, and the mask."""
+
 
 class Gatherer:
     """Fetches a drawn batch.
@@ -49,7 +52,7 @@ class Gatherer:
             self._buffers = kind(num_tasks * each_task, device)
         else:
             self._buffers = _HostBuffers(num_tasks * each_task, device)
-        self._layouts: dict[int, list[tuple[list[_Field], Tensor]]] = {}
+        self._layouts: dict[int, list[_Fields | Steps]] = {}
         self._window_length = sizes.window_length
 
     def __call__(self, draw: Draw) -> Batch:
@@ -58,14 +61,17 @@ class Gatherer:
         memory = self._buffers.take()
         ends, end = [0], 0
         for view, rows in zip(self._views, (draw.transitions, draw.windows, starts), strict=True):
-            end += rows.size * view.shape[1]
-            block = memory[ends[-1] : end].view(rows.size, view.shape[1])
-            torch.index_select(view, 0, torch.from_numpy(rows.reshape(-1)).to(memory.device), out=block)
+            if rows.size:
+                end += rows.size * view.shape[1]
+                block = memory[ends[-1] : end].view(rows.size, view.shape[1])
+                index = torch.from_numpy(rows.reshape(-1)).to(memory.device)
+                torch.index_select(view, 0, index, out=block)
             ends.append(end)
         mask = self._trajectory_mask(draw, memory[ends[2] : end]) if self._is_ragged else None
         memory = self._buffers.hand_out(memory)
         transitions, windows, context, execution = (
-            self._steps(memory, fields, constant) for fields, constant in self._layout(draw, ends)
+            each if isinstance(each, Steps) else self._steps(memory, *each)
+            for each in self._layout(draw, ends)
         )
         if mask is not None:
             context = replace(context, mask=mask[:, : draw.num_context])
@@ -80,8 +86,8 @@ class Gatherer:
         )
         return Steps(observations, actions, rewards, following, terminated, mask)
 
-    def _layout(self, draw: Draw, ends: list[int]) -> list[tuple[list[_Field], Tensor]]:
-        """Fields of transitions, windows, context and execution, with masks; the same for equal sizes."""
+    def _layout(self, draw: Draw, ends: list[int]) -> list[_Fields | Steps]:
+        """Where transitions, windows, context and execution lie, or what they are where they are empty."""
         if draw.num_context not in self._layouts:
             step, window, trajectory = (view.shape[1] for view in self._views)
             count, longest, width = draw.trajectories.shape[1], self._longest, self._width
@@ -97,9 +103,7 @@ class Gatherer:
             ]
         return self._layouts[draw.num_context]
 
-    def _fields(
-        self, shape: tuple[int, ...], strides: tuple[int, ...], offset: int
-    ) -> tuple[list[_Field], Tensor]:
+    def _fields(self, shape: tuple[int, ...], strides: tuple[int, ...], offset: int) -> _Fields | Steps:
         """Where the fields of steps lie whose rows lie in a buffer from an offset on, and a full mask."""
         observation_dim, action_dim = self._rows.observation_dim, self._rows.action_dim
         last = offset + self._width - 1
@@ -111,9 +115,11 @@ class Gatherer:
             (vectors, rows, offset + self._width),
             (shape, strides, last),
         ]
-        if 0 in shape:  # nothing lies there, not even in the buffer
-            fields = [(size, stride, 0) for size, stride, _ in fields]
-        return fields, torch.ones(shape, dtype=torch.bool, device=self._device)
+        mask = torch.ones(shape, dtype=torch.bool, device=self._device)
+        if 0 in shape:
+            empty = torch.empty(0, device=self._device)
+            return self._steps(empty, [(size, stride, 0) for size, stride, _ in fields], mask)
+        return fields, mask
 
     def _trajectory_mask(self, draw: Draw, block: Tensor) -> Tensor:
         """(tasks, trajectories, longest episode); clears in the gathered block what follows an episode."""
