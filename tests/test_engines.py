@@ -280,8 +280,8 @@ def test_a_worker_that_ends_before_it_has_read_its_spec_is_a_crash(
     """The worker's end is awaited before its spec is written, which then meets a closed pipe."""
     start = _attempt._start_worker
 
-    def start_and_outlive(errors: IO[str]) -> "subprocess.Popen[str]":
-        worker = start(errors)
+    def start_and_outlive(unit: Unit, errors: IO[str]) -> "subprocess.Popen[str]":
+        worker = start(unit, errors)
         worker.wait()
         return worker
 
