@@ -41,7 +41,7 @@ class CheckpointFolder:
         unit: names the subfolder.
         key: digest of everything that the training depends on; a checkpoint with another key is ignored.
         before: a checkpoint at or after this training step is of no use, since a snapshot is missing there.
-        seconds: time between two checkpoints.
+        seconds: time between two checkpoints, at least; 0 for one at every opportunity.
     """
 
     def __init__(
@@ -53,7 +53,8 @@ class CheckpointFolder:
 
     def is_due(self) -> bool:
         """It is time for a checkpoint: large ones come more rarely, so that they cost little of the time."""
-        return time.monotonic() - self._saved >= max(self._seconds, self._cost / CHECKPOINT_SHARE)
+        wait = max(self._seconds, self._cost / CHECKPOINT_SHARE) if self._seconds else 0.0
+        return time.monotonic() - self._saved >= wait
 
     def save(self, checkpoint: Checkpoint) -> None:
         """Puts a checkpoint in the place of the last one."""

@@ -290,10 +290,10 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
     """Its own process, with checkpoints at every look at the clock; what they hold dominates."""
     overrides = (
         "behavior.sac.hidden=[384,384]",
-        "behavior.sac.steps=200",
-        "behavior.sac.buffer_size=200",
-        "behavior.sac.warmup=195",
-        "behavior.sac.snapshots=[0,200]",
+        "behavior.sac.steps=60",
+        "behavior.sac.buffer_size=60",
+        "behavior.sac.warmup=58",
+        "behavior.sac.snapshots=[0,60]",
         "behavior.stacked.group=20",
         "rollouts.episodes=10",
     )
