@@ -8,9 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tcmrl_data.batch import Batch, BatchSizes, Moments, Steps
     from tcmrl_data.build import BuildReport, build_dataset
-    from tcmrl_data.cache import CacheEntry, cache_folder, cache_limit, clear_cache, list_cache, parse_bytes
     from tcmrl_data.canonical import canonical_json, parse_json
     from tcmrl_data.dataset import Dataset, open_dataset
     from tcmrl_data.discovery import plugin
@@ -26,11 +24,9 @@ if TYPE_CHECKING:
     )
     from tcmrl_data.errors import CheckpointError, SelectionError, TcmrlError, TrainingError
     from tcmrl_data.events import BuildEvent, BuildStatus, build_status
-    from tcmrl_data.garbage import Garbage, collect_garbage
     from tcmrl_data.listing import list_datasets
     from tcmrl_data.manifest import Manifest
     from tcmrl_data.plan import Plan, plan_build
-    from tcmrl_data.prefetch import Prefetch
     from tcmrl_data.recipe import (
         PROFILES,
         Recipe,
@@ -39,22 +35,31 @@ if TYPE_CHECKING:
         list_environments,
         load_recipe,
     )
-    from tcmrl_data.repair import RepairReport, repair_dataset
-    from tcmrl_data.replay import Replay
     from tcmrl_data.returns import return_table
     from tcmrl_data.rollout import roll_out
     from tcmrl_data.sampler import Sampler
+    from tcmrl_data.sampling.batch import Batch, BatchSizes, Moments, Steps
+    from tcmrl_data.sampling.cache import (
+        CacheEntry,
+        cache_folder,
+        cache_limit,
+        clear_cache,
+        list_cache,
+        parse_bytes,
+    )
+    from tcmrl_data.sampling.prefetch import Prefetch
     from tcmrl_data.seeding import NO_TASK, Purpose, keyed_generator, keyed_seed
     from tcmrl_data.selection import Selection
     from tcmrl_data.snapshot import import_sac
     from tcmrl_data.tasks import Task, draw_tasks, parse_indices
     from tcmrl_data.trajectory import Trajectory
+    from tcmrl_data.verification.garbage import Garbage, collect_garbage
+    from tcmrl_data.verification.repair import RepairReport, repair_dataset
+    from tcmrl_data.verification.replay import Replay
     from tcmrl_data.verify import Finding, VerifyLevel, VerifyReport, verify_dataset
 
 _HOMES = {
-    "batch": ("Batch", "BatchSizes", "Moments", "Steps"),
     "build": ("BuildReport", "build_dataset"),
-    "cache": ("CacheEntry", "cache_folder", "cache_limit", "clear_cache", "list_cache", "parse_bytes"),
     "canonical": ("canonical_json", "parse_json"),
     "dataset": ("Dataset", "open_dataset"),
     "discovery": ("plugin",),
@@ -68,24 +73,33 @@ _HOMES = {
         "environment_types",
         "make_environment",
     ),
-    "events": ("BuildEvent", "BuildStatus", "build_status"),
     "errors": ("CheckpointError", "SelectionError", "TcmrlError", "TrainingError"),
-    "garbage": ("Garbage", "collect_garbage"),
+    "events": ("BuildEvent", "BuildStatus", "build_status"),
     "listing": ("list_datasets",),
     "manifest": ("Manifest",),
     "plan": ("Plan", "plan_build"),
-    "prefetch": ("Prefetch",),
     "recipe": ("PROFILES", "Recipe", "apply_overrides", "first_problem", "list_environments", "load_recipe"),
-    "repair": ("RepairReport", "repair_dataset"),
-    "replay": ("Replay",),
     "returns": ("return_table",),
     "rollout": ("roll_out",),
     "sampler": ("Sampler",),
+    "sampling.batch": ("Batch", "BatchSizes", "Moments", "Steps"),
+    "sampling.cache": (
+        "CacheEntry",
+        "cache_folder",
+        "cache_limit",
+        "clear_cache",
+        "list_cache",
+        "parse_bytes",
+    ),
+    "sampling.prefetch": ("Prefetch",),
     "seeding": ("NO_TASK", "Purpose", "keyed_generator", "keyed_seed"),
     "selection": ("Selection",),
     "snapshot": ("import_sac",),
     "tasks": ("Task", "draw_tasks", "parse_indices"),
     "trajectory": ("Trajectory",),
+    "verification.garbage": ("Garbage", "collect_garbage"),
+    "verification.repair": ("RepairReport", "repair_dataset"),
+    "verification.replay": ("Replay",),
     "verify": ("Finding", "VerifyLevel", "VerifyReport", "verify_dataset"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}

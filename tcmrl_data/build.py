@@ -16,8 +16,8 @@ from tcmrl_data.manifest import DATA_VERSION, MANIFEST, read_manifest
 from tcmrl_data.part import part_bytes
 from tcmrl_data.publish import CHECKPOINTS, LOCK, STAGING, lock_file, make_folders, remove_abandoned
 from tcmrl_data.recipe import Recipe
-from tcmrl_data.scan import check_work_files
 from tcmrl_data.tasks import Task, choose_tasks
+from tcmrl_data.verification.scan import check_work_files
 
 OWN_FILES = {MANIFEST, LOCK, STAGING, CHECKPOINTS, EVENTS, "zarr.json", "tasks"}
 

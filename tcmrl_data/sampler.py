@@ -4,13 +4,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from tcmrl_data.batch import Batch, BatchSizes, Moments, Steps
-from tcmrl_data.draws import Draws
 from tcmrl_data.errors import SelectionError
-from tcmrl_data.gather import Gatherer
-from tcmrl_data.moments import moments_of
-from tcmrl_data.prefetch import Prefetch
-from tcmrl_data.rows import Rows
+from tcmrl_data.sampling.batch import Batch, BatchSizes, Moments, Steps
+from tcmrl_data.sampling.draws import Draws
+from tcmrl_data.sampling.gather import Gatherer
+from tcmrl_data.sampling.moments import moments_of
+from tcmrl_data.sampling.prefetch import Prefetch
+from tcmrl_data.sampling.rows import Rows
 from tcmrl_data.seeding import NO_TASK, Purpose, keyed_sequence
 
 __all__ = ["Batch", "BatchSizes", "Moments", "Sampler", "Steps"]

@@ -102,8 +102,8 @@ class Selection:
         Raises:
             SelectionError: the selection holds test tasks, fewer than two tasks, or too little of one.
         """
-        from tcmrl_data.cache import load_rows
         from tcmrl_data.sampler import Sampler
+        from tcmrl_data.sampling.cache import load_rows
 
         test = [task.index for task in self.tasks if task.split == "test"]
         if test:

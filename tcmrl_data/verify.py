@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Literal
 
 from tcmrl_data.canonical import sha256
-from tcmrl_data.contents import content_problems, task_problems
 from tcmrl_data.errors import ManifestError
 from tcmrl_data.layout import GROUP
 from tcmrl_data.manifest import (
@@ -27,8 +26,9 @@ from tcmrl_data.manifest import (
 )
 from tcmrl_data.part_files import identity_problems, layout_problems
 from tcmrl_data.plain_files import file_problem, folder_problem, one_line, read_plain_file, words_after
-from tcmrl_data.replay import Replay, replay_part, spread_parts
-from tcmrl_data.scan import Scan, scan_dataset
+from tcmrl_data.verification.contents import content_problems, task_problems
+from tcmrl_data.verification.replay import Replay, replay_part, spread_parts
+from tcmrl_data.verification.scan import Scan, scan_dataset
 
 VerifyLevel = Literal["quick", "digests", "deep"]
 Key = tuple[int, int]

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from tcmrl_data import BatchSizes, Trajectory
-from tcmrl_data.rows import Episodes, Rows, fill_rows
 from tcmrl_data.sampler import Sampler
+from tcmrl_data.sampling.rows import Episodes, Rows, fill_rows
 from tcmrl_data.store import pack
 
 

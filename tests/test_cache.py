@@ -22,10 +22,10 @@ from tcmrl_data import (
     open_dataset,
     parse_bytes,
 )
-from tcmrl_data.cache import cached_rows, load_rows
-from tcmrl_data.cache_entry import _write_rows
 from tcmrl_data.errors import CacheError, StoreError
-from tcmrl_data.rows import Indices, PartRows, Table, read_rows
+from tcmrl_data.sampling.cache import cached_rows, load_rows
+from tcmrl_data.sampling.cache_entry import _write_rows
+from tcmrl_data.sampling.rows import Indices, PartRows, Table, read_rows
 from tests.commands import Call, in_process
 
 SIZES = BatchSizes(transitions=20, windows=5, window_length=3)
@@ -124,7 +124,7 @@ def test_what_is_read_is_never_evicted(
 
 def test_another_process_keeps_its_entry_too(selection: Selection, tiny_folder: Path, folder: Path) -> None:
     code = (
-        "import sys, tcmrl_data; from tcmrl_data.cache import cached_rows\n"
+        "import sys, tcmrl_data; from tcmrl_data.sampling.cache import cached_rows\n"
         f"rows = cached_rows(tcmrl_data.open_dataset({str(tiny_folder)!r}).select(split='train'))\n"
         "print('ready', flush=True); sys.stdin.read()"
     )
@@ -154,7 +154,7 @@ def test_what_was_used_longest_ago_goes_first(tiny: Dataset, monkeypatch: pytest
 
 def test_a_disk_without_room_is_refused(selection: Selection, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = type("Usage", (), {"free": 10})
-    monkeypatch.setattr("tcmrl_data.cache.shutil.disk_usage", lambda path: usage)
+    monkeypatch.setattr("tcmrl_data.sampling.cache.shutil.disk_usage", lambda path: usage)
     with pytest.raises(CacheError, match="TCMRL_CACHE"):
         cached_rows(selection)
 
@@ -180,8 +180,8 @@ def test_decoding_takes_the_memory_of_the_parts_at_work(
         out[...] = part.first
         return np.array([len(out) - 1])
 
-    monkeypatch.setattr("tcmrl_data.rows.READERS", 1)
-    monkeypatch.setattr("tcmrl_data.cache_entry.read_part", fill)
+    monkeypatch.setattr("tcmrl_data.sampling.rows.READERS", 1)
+    monkeypatch.setattr("tcmrl_data.sampling.cache_entry.read_part", fill)
     rows = 2**18 // 8
     plan = [PartRows(tmp_path, 0, rows * i, rows * (i + 1)) for i in range(40)]
     tracemalloc.start()

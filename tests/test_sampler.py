@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tcmrl_data import Batch, BatchSizes, Dataset, Steps, Trajectory
-from tcmrl_data.draws import BLOCK, distinct
 from tcmrl_data.errors import SelectionError
 from tcmrl_data.sampler import Sampler
+from tcmrl_data.sampling.draws import BLOCK, distinct
 from tests.sampling import numbered_tasks, sampler_of
 from tests.strategies import trajectories
 
@@ -228,7 +228,7 @@ def test_distinct_draws_are_uniform() -> None:
 def test_moments_equal_those_of_the_flat_data(chunk_rows: int, episodes: list[list[Trajectory]]) -> None:
     sizes = BatchSizes(transitions=4, window_length=2)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tcmrl_data.moments.CHUNK_ROWS", chunk_rows)
+        patch.setattr("tcmrl_data.sampling.moments.CHUNK_ROWS", chunk_rows)
         found = sampler_of(episodes, sizes).moments()
     flat = [each for task in episodes for each in task]
     observations = np.concatenate([each.observations[:-1] for each in flat]).astype(np.float64)
@@ -270,7 +270,7 @@ def test_no_task_parameter_is_reachable_from_a_batch(sampler: Sampler) -> None:
 def test_batches_on_a_device_equal_those_on_the_cpu(
     tiny: Dataset, share: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tcmrl_data.gather.DEVICE_SHARE", share)
+    monkeypatch.setattr("tcmrl_data.sampling.gather.DEVICE_SHARE", share)
     selection = tiny.select(split="train")
     left, right = (selection.sampler(SIZES, seed=1, device=name) for name in ("cpu", "cuda"))
     with right.prefetch(0, 20) as batches:

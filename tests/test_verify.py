@@ -18,15 +18,15 @@ from tcmrl_cli.frame import run
 
 import tcmrl_data
 from tcmrl_data import open_dataset, repair_dataset, verify_dataset
-from tcmrl_data import repair as repair_module
-from tcmrl_data import replay as replay_module
 from tcmrl_data.errors import LockedError, ManifestError, NondeterminismError, SnapshotError
 from tcmrl_data.events import EVENTS
-from tcmrl_data.garbage import collect_garbage
 from tcmrl_data.manifest import MANIFEST, part_folder, read_manifest
 from tcmrl_data.publish import CHECKPOINTS, LOCK, STAGING, lock_file
 from tcmrl_data.snapshot import read_snapshot
 from tcmrl_data.store import array_digests, encode_arrays
+from tcmrl_data.verification import repair as repair_module
+from tcmrl_data.verification import replay as replay_module
+from tcmrl_data.verification.garbage import collect_garbage
 from tests.hostile_corpus import PART, STEP, Forge, base
 
 Copy = Callable[[], Path]

@@ -23,7 +23,7 @@ from tcmrl_data.publish import (
     remove_tree,
     replace_file,
 )
-from tcmrl_data.scan import check_work_files
+from tcmrl_data.verification.scan import check_work_files
 from tcmrl_data.verify import Finding, Key, VerifyLevel, verify_dataset
 
 REPAIR = "repair"

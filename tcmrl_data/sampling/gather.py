@@ -8,9 +8,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tcmrl_data.batch import Batch, BatchSizes, Steps
-from tcmrl_data.draws import Draw
-from tcmrl_data.rows import Rows, Table
+from tcmrl_data.sampling.batch import Batch, BatchSizes, Steps
+from tcmrl_data.sampling.draws import Draw
+from tcmrl_data.sampling.rows import Rows, Table
 
 SPARE_BUFFERS = 8
 """Buffers kept for later batches; more exist while more batches are held."""

@@ -3,8 +3,8 @@
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.batch import Moments
-from tcmrl_data.rows import Episodes, Rows
+from tcmrl_data.sampling.batch import Moments
+from tcmrl_data.sampling.rows import Episodes, Rows
 
 CHUNK_ROWS = 2**16
 SMALLEST_STD = 1e-6

@@ -15,7 +15,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcmrl_data.cache_entry import (
+from tcmrl_data.canonical import digest
+from tcmrl_data.errors import CacheError, LockedError
+from tcmrl_data.publish import LOCK, STAGING, lock_file, make_folders, remove_abandoned, remove_tree
+from tcmrl_data.sampling.cache_entry import (
     FORMAT,
     RECORD,
     is_current,
@@ -25,10 +28,7 @@ from tcmrl_data.cache_entry import (
     try_lock,
     write_entry,
 )
-from tcmrl_data.canonical import digest
-from tcmrl_data.errors import CacheError, LockedError
-from tcmrl_data.publish import LOCK, STAGING, lock_file, make_folders, remove_abandoned, remove_tree
-from tcmrl_data.rows import Rows, plan_rows, read_rows, table_shape
+from tcmrl_data.sampling.rows import Rows, plan_rows, read_rows, table_shape
 
 if TYPE_CHECKING:
     from tcmrl_data.selection import Selection

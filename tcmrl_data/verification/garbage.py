@@ -15,8 +15,8 @@ from tcmrl_data.publish import (
     remove_abandoned,
     remove_tree,
 )
-from tcmrl_data.repair import REPAIR
-from tcmrl_data.scan import check_work_files
+from tcmrl_data.verification.repair import REPAIR
+from tcmrl_data.verification.scan import check_work_files
 
 CHECKPOINT = re.compile(r"task_([0-9]{5,10})")
 

@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.batch import BatchSizes
-from tcmrl_data.rows import Episodes, Indices
+from tcmrl_data.sampling.batch import BatchSizes
+from tcmrl_data.sampling.rows import Episodes, Indices
 
 Uniform = npt.NDArray[np.float64]
 

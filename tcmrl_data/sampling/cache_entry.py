@@ -28,7 +28,7 @@ from tcmrl_data.publish import (
     remove_tree,
     write_file,
 )
-from tcmrl_data.rows import (
+from tcmrl_data.sampling.rows import (
     Episodes,
     Indices,
     PartRows,
