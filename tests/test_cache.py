@@ -16,13 +16,13 @@ from tcmrl_data import (
     BatchSizes,
     Dataset,
     Selection,
-    cache,
     clear_cache,
     list_cache,
     open_dataset,
     parse_bytes,
 )
 from tcmrl_data.errors import CacheError, StoreError
+from tcmrl_data.sampling import cache
 from tcmrl_data.sampling.cache import cached_rows, load_rows
 from tcmrl_data.sampling.cache_entry import _write_rows
 from tcmrl_data.sampling.rows import Indices, PartRows, Table, read_rows
