@@ -199,7 +199,7 @@ def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
     end: signal.Signals, tiny_folder: Path, tmp_path: Path, mark: str
 ) -> None:
     content = experiments.tables(tiny_folder)
-    content["training"] = content["training"] | {"run": content["training"]["run"] | {"steps": 200}}
+    content["training"] = content["training"] | {"run": content["training"]["run"] | {"steps": 400}}
     file = experiments.write_file(tmp_path / "small.toml", content)
     out = tmp_path / "out"
     arguments = ["experiment", str(file), "--out", str(out), "--only", "TCMRL", "--seeds", "1"]
@@ -220,13 +220,13 @@ def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
     assert process.returncode == (1 if end == signal.SIGINT else -signal.SIGKILL)
     assert ("to go on run" in errors) == (end == signal.SIGINT)
     assert not folder.with_name(f"{folder.name}.json").exists()
-    assert open_run(folder).newest().step < 200
+    assert open_run(folder).newest().step < 400
     experiment = read_experiment(content, place="test")
     (resumed,) = run_experiment(experiment, out, only=["TCMRL"], seeds=[1]).results
     dataset = tcmrl_data.open_dataset(tiny_folder)
     straight = train_run(dataset, tmp_path / "straight", config=resumed.config, profile="quick", seed=1)
     assert resumed.digest == straight.digest
-    assert [each.step for each in resumed.curve] == [100, 200]
+    assert [each.step for each in resumed.curve] == [200, 400]
 
 
 def test_a_missing_experiment_attribute_is_named() -> None:
