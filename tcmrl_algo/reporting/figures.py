@@ -113,12 +113,20 @@ def _by_method(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
 
 
 def _draw_references(axes: "Axes", result: RunResult) -> None:
+    """Lines of the oracle and of uniform actions, the latter only where it leaves the curves room."""
     tasks = next(iter(result.evaluations.values()))["tasks"]
-    for name, line in (("oracle", "--"), ("random", ":")):
+    low, high = axes.get_ylim()
+    for name, label, line in (("oracle", "oracle", "--"), ("random", "uniform actions", ":")):
         values = [task[name] for task in tasks]
-        if None not in values:
-            label = "uniform actions" if name == "random" else name
-            axes.axhline(float(np.mean(values)), color="0.3", linestyle=line, label=label)
+        if None in values:
+            continue
+        mean = float(np.mean(values))
+        if name == "oracle":
+            high = max(high, mean)
+        elif low - mean > high - low:
+            axes.plot([], [], color="0.3", linestyle=line, label=f"{label}: {mean:.1f}")
+            continue
+        axes.axhline(mean, color="0.3", linestyle=line, label=label)
 
 
 def _color(index: int, count: int) -> tuple[float, float, float, float]:
