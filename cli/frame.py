@@ -27,7 +27,7 @@ DONE, INCOMPLETE, BAD_INPUT = 0, 1, 2
 SPANS = ((86_400, "d", 3_600, "h"), (3_600, "h", 60, "min"), (60, "min", 1, "s"))
 """Seconds and name of a unit of time, and of the one shown beside it."""
 
-PIPE_WIDTH = 160
+PIPE_WIDTH = 250
 """Columns of a table that does not go to a terminal."""
 
 
