@@ -18,9 +18,9 @@ from tcmrl_data.recipe import Recipe
 from tcmrl_data.tasks import Task
 
 PROCESS_BYTES = 400 * 2**20
-"""A worker beside its data: torch, MuJoCo, Zarr, Stable-Baselines3; measured as 310 to 390 MB."""
+"""A worker beside its data: torch, MuJoCo and Zarr take about 310 MB as measured; the rest is margin."""
 HOLES = 0.04
-"""Share of a set of simulators that stays lost with every part made; measured on half-cheetah-vel."""
+"""Share of a set of simulators, as planned, that stays lost with every part; measured on half-cheetah-vel."""
 PART_COPIES = 4
 """A part's arrays lie in memory as lane arrays, trajectories, packed rows and files."""
 
