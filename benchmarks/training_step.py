@@ -1,8 +1,9 @@
 """What one training step costs, part by part, against the machine's matmul peak. Prints JSON.
 
-`python benchmarks/training_step.py [--threads N] [--algorithm NAME] [--repeats N]`; made-up batches at the
-paper's network sizes, no dataset needed. Times are the least of the repeats. On a machine that others use,
-read the shares by CPU time: step and peak in seconds of the process's threads, the one beside the other.
+`python benchmarks/training_step.py [--threads N] [--algorithm NAME] [--precision NAME] [--repeats N]`;
+made-up batches at the paper's network sizes, no dataset needed. Times are the least of the repeats; the peak
+is that of float32 in either precision. On a machine that others use, read the shares by CPU time: step and
+peak in seconds of the process's threads, the one beside the other.
 """
 
 import argparse
@@ -21,6 +22,7 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from tcmrl_algo import ContextAlgorithm
 from tcmrl_algo.config import ALGORITHMS, TrainingSettings
+from tcmrl_algo.memory import keep_freed_memory
 from tcmrl_algo.problem import Problem
 from tcmrl_data import Batch, Steps, plugin
 
@@ -77,7 +79,7 @@ class Stopwatch:
         setattr(owner, attribute, timed)
 
 
-def made_up(sizes: Sizes, algorithm: str) -> tuple[ContextAlgorithm, Batch]:
+def made_up(sizes: Sizes, algorithm: str, precision: str) -> tuple[ContextAlgorithm, Batch]:
     """An algorithm at the paper's sizes and a batch for it."""
     observation, action = sizes.observation_dim, sizes.action_dim
     generator = torch.Generator().manual_seed(0)
@@ -111,7 +113,7 @@ def made_up(sizes: Sizes, algorithm: str) -> tuple[ContextAlgorithm, Batch]:
         device=torch.device("cpu"),
     )
     batch = {"tasks": sizes.tasks, "transitions": sizes.transitions, "window_length": 4}
-    settings = TrainingSettings.model_validate({"batch": batch})
+    settings = TrainingSettings.model_validate({"batch": batch, "run": {"precision": precision}})
     module = plugin(ALGORITHMS, "algorithm", algorithm)
     made = module.create(problem, settings, module.Config())
     assert isinstance(made, ContextAlgorithm)
@@ -174,9 +176,9 @@ def needed_work(made: ContextAlgorithm, sizes: Sizes) -> int:
     return total
 
 
-def measure(sizes: Sizes, *, algorithm: str, repeats: int) -> dict[str, Any]:
+def measure(sizes: Sizes, *, algorithm: str, precision: str, repeats: int) -> dict[str, Any]:
     """Seconds and operations of a step, whole and by part."""
-    made, batch = made_up(sizes, algorithm)
+    made, batch = made_up(sizes, algorithm, precision)
     made.update(batch, 1)
     with FlopCounterMode(display=False) as counter:
         made.update(batch, 2)
@@ -201,12 +203,12 @@ def measure(sizes: Sizes, *, algorithm: str, repeats: int) -> dict[str, Any]:
     }
 
 
-def components(sizes: Sizes, *, algorithm: str, repeats: int) -> dict[str, float]:
+def components(sizes: Sizes, *, algorithm: str, precision: str, repeats: int) -> dict[str, float]:
     """Milliseconds per step of each part; a part's own, without those inside it.
 
     Last of all: what is watched stays so.
     """
-    made, batch = made_up(sizes, algorithm)
+    made, batch = made_up(sizes, algorithm, precision)
     made.update(batch, 1)
     least: dict[str, float] = {}
     watch = Stopwatch()
@@ -231,12 +233,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--algorithm", default="tcmrl")
+    parser.add_argument("--precision", choices=["float32", "bfloat16"], default="float32")
     parser.add_argument("--repeats", type=int, default=10)
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
-    how = {"algorithm": options.algorithm, "repeats": options.repeats}
+    keep_freed_memory()
+    how = {"algorithm": options.algorithm, "precision": options.precision, "repeats": options.repeats}
     document = {
         "algorithm": options.algorithm,
+        "precision": options.precision,
         "threads": options.threads,
         "torch": torch.__version__,
         "load_average": os.getloadavg()[0],

@@ -27,6 +27,8 @@ class RunSettings(BaseModel):
             stored contexts in evaluation; those of `snapshots` if left out. The actor-critic's
             transitions are always those of `snapshots`.
         threads: CPU threads of torch; results depend on it in their last bits.
+        precision: in which hidden layers multiply; all else is float32. `bfloat16` is faster where the
+            processor multiplies it in hardware, and changes results.
         log_every: steps between two lines of metrics.
         checkpoint_every: steps between two checkpoints.
         protocol: how to adapt to test tasks (paper, section 4.2: `paper`).
@@ -43,6 +45,7 @@ class RunSettings(BaseModel):
     snapshots: str = "all"
     context_snapshots: str | None = None
     threads: int = Field(default=1, ge=1)
+    precision: Literal["float32", "bfloat16"] = "float32"
     log_every: int = Field(default=100, ge=1)
     checkpoint_every: int = Field(default=5_000, ge=1)
     protocol: Protocol = "paper"

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from tcmrl_algo.actor_critic import ActorCritic
 from tcmrl_algo.config import TrainingSettings
-from tcmrl_algo.networks import Attention
+from tcmrl_algo.networks import Attention, set_hidden_dtype
 from tcmrl_algo.optimizer import Adam
 from tcmrl_algo.problem import Algorithm, Metrics, Problem, TrainedModules
 from tcmrl_data import Batch, Controller, Steps, Trajectory, UniformController
@@ -86,6 +86,7 @@ class ContextAlgorithm(Algorithm):
             generator=problem.generator(0, ACTOR_CRITIC_STREAM),
         ).to(problem.device)
         everything = nn.ModuleDict({"context": self.learner, "actor_critic": self.actor_critic})
+        set_hidden_dtype(everything, getattr(torch, settings.run.precision))
         self._adam = settings.optimizer.build(everything, decay_steps=problem.steps)
         own = {**self.learner.optimizers(), **self.actor_critic.optimizers()}
         self._trained = TrainedModules({"all": everything}, {"all": self._adam, **own})

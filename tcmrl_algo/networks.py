@@ -45,22 +45,39 @@ class Perceptron(nn.Module):
         sizes: width of input, hidden layers and output; two entries make one linear layer.
         activation: between layers, not after the last; it may work in place, which spares a pass over memory.
         generator: draws the start.
+
+    Attributes:
+        hidden_dtype: in which the hidden layers multiply; parameters, the last layer and all losses stay
+            float32. See `set_hidden_dtype`.
     """
+
+    hidden_dtype: torch.dtype
 
     def __init__(
         self, sizes: Sequence[int], *, generator: torch.Generator, activation: Activation = torch.relu_
     ) -> None:
         super().__init__()
+        self.hidden_dtype = torch.float32
         self._activation = activation
         self.layers = nn.ModuleList(
             linear(inputs, outputs, generator) for inputs, outputs in itertools.pairwise(sizes)
         )
 
     def forward(self, inputs: Float[Tensor, "*rows inputs"]) -> Float[Tensor, "*rows outputs"]:
-        for layer in self.layers[:-1]:
-            inputs = self._activation(layer(inputs))
-        result: Tensor = self.layers[-1](inputs)
-        return result
+        rows = inputs.reshape(-1, inputs.shape[-1])  # an activation in place on a view would copy gradients
+        reduced = self.hidden_dtype is not torch.float32
+        with torch.autocast(rows.device.type, self.hidden_dtype, enabled=reduced):
+            for layer in self.layers[:-1]:
+                rows = self._activation(layer(rows))
+        outputs: Tensor = self.layers[-1](rows.to(inputs.dtype))
+        return outputs.view(*inputs.shape[:-1], -1)
+
+
+def set_hidden_dtype(module: nn.Module, dtype: torch.dtype) -> None:
+    """Lets the hidden layers of all perceptrons in a module multiply in float32 or bfloat16."""
+    for each in module.modules():
+        if isinstance(each, Perceptron):
+            each.hidden_dtype = dtype
 
 
 @final

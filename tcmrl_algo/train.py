@@ -15,6 +15,7 @@ from torch import Tensor
 from tcmrl_algo.batches import Batches, open_batches
 from tcmrl_algo.checkpoint import Run, RunRecord, open_run, write_run
 from tcmrl_algo.config import ALGORITHMS, TrainingConfig, validated
+from tcmrl_algo.memory import keep_freed_memory
 from tcmrl_algo.metrics import MetricsWriter
 from tcmrl_algo.problem import Algorithm, MomentsRecord, problem_of
 from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError, plugin
@@ -221,6 +222,7 @@ def _train(
 ) -> TrainingReport:
     """The loop: batch n - 1 makes step n."""
     settings, last = run.record.config.settings.run, run.record.steps
+    keep_freed_memory()
     began = time.perf_counter()
     logged_at, logged_step, logged_wait = began, start, 0.0
     with (

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from tcmrl_algo.encoding import ContextEncoder
 from tcmrl_algo.networks import (
@@ -16,6 +16,7 @@ from tcmrl_algo.networks import (
     Standardizer,
     TaskExtractor,
     call_frozen,
+    set_hidden_dtype,
     side_by_side,
     uniform_attention,
 )
@@ -116,6 +117,21 @@ def test_ensemble_members_are_separate_perceptrons() -> None:
         hidden = torch.relu(network.layers[0](inputs))
         torch.testing.assert_close(values[member], network.layers[1](hidden).squeeze(-1))
     assert not torch.allclose(values[0], values[1])
+
+
+def test_hidden_layers_in_bfloat16_round_and_leave_parameters_and_outputs_in_float32() -> None:
+    network, inputs = Perceptron((3, 32, 32, 1), generator=generator()), random(5, 2, 3).requires_grad_()
+    exact = network(inputs)
+    set_hidden_dtype(nn.ModuleDict({"inner": network}), torch.bfloat16)
+    rounded = network(inputs)
+    assert rounded.dtype == torch.float32
+    assert not torch.equal(rounded, exact)
+    torch.testing.assert_close(rounded, exact, atol=0.02, rtol=0.02)
+    rounded.sum().backward()
+    for each in (inputs, *network.parameters()):
+        assert each.grad is not None
+        assert each.grad.dtype == torch.float32
+        assert each.grad.abs().sum() > 0
 
 
 def test_starts_depend_on_the_generator_alone() -> None:

@@ -113,6 +113,12 @@ def test_one_seed_gives_the_same_parameters_after_100_steps(start: Train, algori
     assert start("third", algorithm=algorithm, steps=100, seed=4).digest != first.digest
 
 
+def test_precision_reaches_training_and_keeps_it_repeatable(start: Train) -> None:
+    first = start("first", "run.precision=bfloat16", steps=20)
+    assert start("second", "run.precision=bfloat16", steps=20).digest == first.digest
+    assert start("third", "run.precision=float32", steps=20).digest != first.digest
+
+
 @pytest.mark.parametrize("brac", ["off", "policy"])
 def test_resuming_at_50_gives_the_same_parameters_at_100(start: Train, tiny: Dataset, brac: str) -> None:
     mode = f"actor_critic.brac.mode={brac}"
