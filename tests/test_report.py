@@ -238,14 +238,27 @@ def test_the_command_writes_reports_on_results_and_on_runs(results: Path, tmp_pa
     assert "Learning curves" not in text
 
 
-def test_a_report_without_checkpoints_says_what_is_left_out(
-    results: Path, tmp_path: Path, call: Call
-) -> None:
+@pytest.fixture
+def copy(results: Path, tmp_path: Path) -> Path:
+    """The results without the runs' checkpoints."""
     copy = tmp_path / "copy"
     (copy / "runs").mkdir(parents=True)
     shutil.copy(results / "experiment.json", copy)
     for file in results.glob("runs/*.json"):
         shutil.copy(file, copy / "runs")
+    return copy
+
+
+def test_claims_of_several_experiments_stand_together_first(copy: Path, tmp_path: Path) -> None:
+    written = write_report([copy, copy], tmp_path / "both")
+    rows = list(csv.DictReader((tmp_path / "both/claims.csv").read_text().splitlines()))
+    assert [each["claim"] for each in rows] == [each.claim for each in written.verdicts]
+    assert {each["experiment"] for each in rows} == {"small", "small-1"}
+    headings = re.findall(r"^## (.+)$", written.report.read_text(), re.MULTILINE)
+    assert headings[0] == "All claims" and len(headings) == 3
+
+
+def test_a_report_without_checkpoints_says_what_is_left_out(copy: Path, call: Call) -> None:
     code, output, _ = call("report", copy)
     assert code == 0
     assert "cannot tell: TCMRL ends higher (point-robot)" in output

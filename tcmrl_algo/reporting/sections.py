@@ -2,7 +2,7 @@
 
 import importlib.resources
 import tomllib
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -55,6 +55,17 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
         mean, _, spread = across_seeds(each.differences)
         rows.append((each.claim, each.environment, each.comparison, mean, spread, each.verdict))
     columns = ("claim", "environment", "compared", "mean difference", "95% interval", "verdict")
+    return Table(name, columns, tuple(rows))
+
+
+def claims_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Table:
+    """The claims of several experiments in short."""
+    rows: list[tuple[Cell, ...]] = []
+    for experiment, verdicts in judged.items():
+        for each in verdicts:
+            mean, _, spread = across_seeds(each.differences)
+            rows.append((experiment, each.claim, each.environment, mean, spread, each.verdict))
+    columns = ("experiment", "claim", "environment", "mean difference", "95% interval", "verdict")
     return Table(name, columns, tuple(rows))
 
 

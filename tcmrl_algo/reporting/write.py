@@ -1,5 +1,6 @@
 """Writes a report: Markdown, with every table as CSV and every figure as PNG beside it."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -106,18 +107,23 @@ def write_report(paths: Sequence[str | Path], out: str | Path, *, report: Progre
         >>> write_report(["results/figure5"], "docs/results/figure5").verdicts  # doctest: +SKIP
     """
     sources = read_sources([Path(each) for each in paths], report)
-    page, trained = Page(Path(out)), Trained()
+    head, page, trained = Page(Path(out)), Page(Path(out)), Trained()
     page.out.mkdir(parents=True, exist_ok=True)
-    page.text("# Report")
-    page.text(NOTE)
-    verdicts: list[Verdict] = []
+    head.text("# Report")
+    head.text(NOTE)
+    judged: dict[str, list[Verdict]] = {}
     for number, source in enumerate(sources):
         name = source.experiment.name
-        twice = any(each.experiment.name == name for each in sources[:number])
-        verdicts += _write_source(page, source, f"{name}-{number}" if twice else name, trained, report)
+        if any(each.experiment.name == name for each in sources[:number]):
+            name = f"{name}-{number}"
+        judged[name] = _write_source(page, source, name, trained, report)
+    verdicts = tuple(itertools.chain.from_iterable(judged.values()))
+    if verdicts and len(judged) > 1:
+        head.text("## All claims")
+        head.table(sections.claims_table("claims", judged))
     file = page.out / "report.md"
-    write_text(file, "\n\n".join(page.lines) + "\n")
-    return Report(file, (file, *page.files), tuple(verdicts))
+    write_text(file, "\n\n".join([*head.lines, *page.lines]) + "\n")
+    return Report(file, (file, *head.files, *page.files), verdicts)
 
 
 def _write_source(page: Page, source: Source, name: str, trained: Trained, report: Progress) -> list[Verdict]:
