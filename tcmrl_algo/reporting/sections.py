@@ -59,14 +59,10 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
 
 
 def claims_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Table:
-    """The claims of several experiments in short."""
-    rows: list[tuple[Cell, ...]] = []
-    for experiment, verdicts in judged.items():
-        for each in verdicts:
-            mean, _, spread = across_seeds(each.differences)
-            rows.append((experiment, each.claim, each.environment, mean, spread, each.verdict))
-    columns = ("experiment", "claim", "environment", "mean difference", "95% interval", "verdict")
-    return Table(name, columns, tuple(rows))
+    """`verdict_table` of several experiments together."""
+    tables = {experiment: verdict_table(name, verdicts) for experiment, verdicts in judged.items()}
+    rows = tuple((experiment, *row) for experiment, table in tables.items() for row in table.rows)
+    return Table(name, ("experiment", *next(iter(tables.values())).columns), rows)
 
 
 def published_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
