@@ -15,17 +15,18 @@ if TYPE_CHECKING:
     from tcmrl_algo import Evaluation
 
 Protocol = Literal["paper", "offline", "idaq"]
-EXPLANATION = (
-    "other: the same policy under other tasks' contexts; regret: oracle - adapted; "
-    "normalized: 0 is uniform actions, 1 the best behavior policy"
-)
+OTHER = "other: the same policy under other tasks' contexts"
+SCORES = {
+    "regret": "regret: oracle - adapted",
+    "normalized": "normalized: 0 is uniform actions, 1 the best behavior policy",
+}
 
 
 def score_table(results: Sequence["Evaluation"]) -> "Table":
     """One row per test task and one of means; under each protocol what adaptation and its control reach."""
     tasks = [task for each in results for task in each.tasks]
     with_success = any(task.success is not None for task in tasks)
-    score = "regret" if any(task.regret is not None for task in tasks) else "normalized"
+    score = _score(results)
     parts = ("adapted", "other", score, *(("success",) if with_success else ()))
     columns = ["task", "uniform", "oracle"]
     columns += [f"{each.protocol}\n{part}" for each in results for part in parts]
@@ -45,6 +46,12 @@ def score_table(results: Sequence["Evaluation"]) -> "Table":
     table.add_section()
     table.add_row("mean", *(number(_mean(column)) for column in zip(*rows, strict=True)))
     return table
+
+
+def _score(results: Sequence["Evaluation"]) -> str:
+    """What is said of a return: how far it is from the oracle where there is one."""
+    tasks = [task for each in results for task in each.tasks]
+    return "regret" if any(task.regret is not None for task in tasks) else "normalized"
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -110,4 +117,4 @@ def evaluate(
         print_json(documents if protocol == "all" else documents[0])
         return
     print_table(score_table(results))
-    remark(EXPLANATION, quiet=quiet)
+    remark(f"{OTHER}; {SCORES[_score(results)]}", quiet=quiet)

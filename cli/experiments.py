@@ -103,7 +103,8 @@ def experiment(
         click.echo(
             f"{report.out}: {ran} runs done, {report.present} were there, in {duration(report.seconds)}"
         )
-        remark(f"Next: tcmrl report {report.out}", quiet=quiet)
+        if report.results:
+            remark(f"Next: tcmrl report {report.out}", quiet=quiet)
     if report.failed:
         more = "" if len(report.failed) == 1 else f" (and {len(report.failed) - 1} more)"
         fail_incomplete(f"{report.failed[0]}{more}; the same command tries again what failed")

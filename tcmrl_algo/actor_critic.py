@@ -23,8 +23,9 @@ class BracSettings(BaseModel):
     """The `[training.actor_critic.brac]` table: behavior regularisation by a dual KL estimate (BRAC, FOCAL).
 
     Attributes:
-        mode: `off`; `policy` adds alpha D to the policy loss; `value` subtracts it from the value target too
-            (published code: on for MuJoCo and Meta-World, off for the point robots).
+        mode: `off`; `policy` adds alpha D to the policy loss; `value` also subtracts alpha D(s) from the
+            target of V(s) (published code: on for MuJoCo and Meta-World, off for the point robots; from the
+            target of Q, with the D of the state before).
         alpha: start of the divergence's weight (published code: 50).
         largest_alpha: its bound (published code: 2e3; 1e4 for Hopper and Walker).
         alpha_learning_rate: step of alpha's dual descent (ours).
@@ -92,9 +93,10 @@ class Rows:
 
 
 def value_bounds(settings: ActorCriticSettings, problem: Problem) -> tuple[float, float]:
-    """Lowest and highest V that rewards within the data's range can add up to, entropy bonus included.
+    """Lowest and highest V that rewards within the data's range can add up to.
 
-    An episode may end after one step, or go on forever: time limits do not cut the sum.
+    An episode may end after one step, or go on forever: time limits do not cut the sum. The highest V
+    includes the largest entropy bonus; the lowest leaves out what a narrow policy's entropy takes away.
     """
     lowest, highest = (settings.reward_scale * each for each in problem.reward_range)
     most_steps = 1.0 / (1.0 - settings.gamma)
@@ -161,7 +163,8 @@ class ActorCritic(nn.Module):
         with torch.no_grad():
             next_values = self.target_value(rows.next_inputs).squeeze(-1)
             if settings.clip_targets:
-                next_values = next_values.clamp(*self.bounds)
+                low, high = self.bounds  # a penalised V may lie below what rewards alone add up to
+                next_values = next_values.clamp(None if settings.brac.mode == "value" else low, high)
         q_values = self.critics(torch.cat([rows.inputs, rows.actions], dim=-1))
         critic_loss = q_loss(q_values, rows.rewards, rows.terminated, next_values, gamma=settings.gamma)
 
@@ -173,12 +176,12 @@ class ActorCritic(nn.Module):
         actor_loss = policy_loss(sample.log_probabilities, acted_values, entropy=settings.entropy)
         metrics: Metrics = {}
         if self.brac is not None:
-            divergence = self.brac.divergence(rows, acted)
-            actor_loss = actor_loss + self.brac.alpha * divergence
+            divergences = self.brac.divergences(rows, acted)
+            actor_loss = actor_loss + self.brac.alpha * divergences.mean()
             if settings.brac.mode == "value":
-                targets = targets - self.brac.alpha * divergence
+                targets = targets - self.brac.alpha * divergences
             metrics = {
-                "actor_critic/divergence": divergence,
+                "actor_critic/divergence": divergences.mean(),
                 "actor_critic/brac_alpha": self.brac.alpha.clone(),
             }
         values = self.value(rows.inputs).squeeze(-1)
@@ -252,13 +255,13 @@ class DualCritic(nn.Module):
         self.register_buffer("alpha", torch.tensor(settings.alpha))
         self.register_buffer("last_divergence", torch.tensor(0.0))
 
-    def divergence(self, rows: Rows, acted: Float[Tensor, "rows inputs"]) -> Tensor:
-        """The estimate under a fixed dual critic; its gradient reaches the policy's actions."""
+    def divergences(self, rows: Rows, acted: Float[Tensor, "rows inputs"]) -> Float[Tensor, " rows"]:
+        """The estimate at each state under a fixed dual critic; its gradient reaches the policy's actions."""
         behavior = torch.cat([rows.inputs, rows.actions], dim=-1)
         result = dual_divergence(
             call_frozen(self.network, behavior).squeeze(-1), call_frozen(self.network, acted).squeeze(-1)
         )
-        self.last_divergence.copy_(result.detach())
+        self.last_divergence.copy_(result.detach().mean())
         return result
 
     def train_once(self, rows: Rows, actions: Tensor, mixture: Tensor) -> None:
@@ -268,7 +271,7 @@ class DualCritic(nn.Module):
         (gradients,) = torch.autograd.grad(scores.sum(), between, create_graph=True)
         behavior = self.network(torch.cat([rows.inputs, rows.actions], dim=-1)).squeeze(-1)
         policy = self.network(torch.cat([rows.inputs, actions], dim=-1)).squeeze(-1)
-        loss = self.settings.penalty * gradient_penalty(gradients) - dual_divergence(behavior, policy)
+        loss = self.settings.penalty * gradient_penalty(gradients) - dual_divergence(behavior, policy).mean()
         self.optimizer.step(loss)
 
     def adapt_alpha(self) -> None:

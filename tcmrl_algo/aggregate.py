@@ -30,12 +30,6 @@ class Summary:
     low: float | None
     high: float | None
 
-    def __str__(self) -> str:
-        """Mean and interval, or mean and seeds where there are too few for an interval."""
-        if self.low is None or self.high is None:
-            return f"{self.mean:.3g} (seeds: {', '.join(f'{each:.3g}' for each in self.values)})"
-        return f"{self.mean:.3g} [{self.low:.3g}, {self.high:.3g}]"
-
 
 def summarize(values: Sequence[float]) -> Summary:
     """Mean, interquartile mean and 95% bootstrap interval of one value per seed.
@@ -47,8 +41,8 @@ def summarize(values: Sequence[float]) -> Summary:
         TrainingError: no value, or one that is not finite.
 
     Example:
-        >>> str(summarize([1.0, 2.0, 6.0]))
-        '3 (seeds: 1, 2, 6)'
+        >>> summarize([1.0, 2.0, 6.0])
+        Summary(values=(1.0, 2.0, 6.0), mean=3.0, iqm=3.0, low=None, high=None)
     """
     from scipy import stats
 
@@ -73,3 +67,22 @@ def summarize(values: Sequence[float]) -> Summary:
         low=low,
         high=high,
     )
+
+
+def mean_interval(differences: Sequence[float]) -> tuple[float, float] | None:
+    """95% interval of the mean by Student's t, None under FEWEST_SEEDS.
+
+    For verdicts: the bootstrap's 95% interval holds the true mean of five normal values in 84% of cases.
+
+    Example:
+        >>> low, high = mean_interval([1.0, 2.0, 3.0, 4.0, 5.0])
+        >>> f"{low:.3f} {high:.3f}"
+        '1.037 4.963'
+    """
+    from scipy import stats
+
+    if len(differences) < FEWEST_SEEDS:
+        return None
+    mean, error = float(np.mean(differences)), float(stats.sem(differences))
+    reach = float(stats.t.ppf((1 + CONFIDENCE) / 2, len(differences) - 1)) * error
+    return mean - reach, mean + reach

@@ -45,12 +45,13 @@ def open_batches(
         selection = dataset.select(split="train", snapshots=snapshots)
         return selection.sampler(sizes, seed=seed, device=str(device), memory_limit=memory_limit, say=say)
 
-    if run.context_snapshots is None:
+    reads = max(sizes.context_trajectories) + sizes.execution_trajectories + sizes.windows
+    if run.context_snapshots is None or not reads:
         return sampler(run.snapshots, sizes)
     nothing = {"context_trajectories": (0,), "execution_trajectories": 0, "windows": 0}
     return JoinedBatches(
         sampler(run.snapshots, sizes.model_copy(update=nothing)),
-        sampler(run.context_snapshots, sizes.model_copy(update={"transitions": 1})),
+        sampler(run.context_snapshots, sizes),  # as many transitions, so that other draws follow them
     )
 
 

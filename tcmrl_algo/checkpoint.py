@@ -1,27 +1,25 @@
 """Runs on disk: `run.json`, and checkpoints of safetensors and JSON that appear whole or not at all."""
 
 import hashlib
-import json
-import os
 import shutil
 import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, TypeVar, final
+from typing import Literal, final
 
 import safetensors.torch
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from safetensors import SafetensorError
 from torch import Tensor
 
 from tcmrl_algo.config import TrainingConfig
 from tcmrl_algo.problem import MomentsRecord
-from tcmrl_data import CheckpointError, Dataset, first_problem
+from tcmrl_algo.records import read_record, sync_folder, write_file, write_record
+from tcmrl_data import CheckpointError, Dataset
 
 KEPT = 2
 """Newest checkpoints kept: the last one, and one to fall back on."""
-Record = TypeVar("Record", bound=BaseModel)
 
 
 class RunRecord(BaseModel):
@@ -88,7 +86,7 @@ class Checkpoint:
         Raises:
             CheckpointError: a file is missing or is not what `checkpoint.json` says.
         """
-        record = _read(CheckpointRecord, self.folder / "checkpoint.json")
+        record = read_record(CheckpointRecord, self.folder / "checkpoint.json")
         file = self.folder / "tensors.safetensors"
         try:
             content = file.read_bytes()
@@ -135,13 +133,13 @@ class Run:
         staging.mkdir(parents=True)
         content = safetensors.torch.save({name: each.cpu().contiguous() for name, each in tensors.items()})
         record = CheckpointRecord(step=step, sha256=hashlib.sha256(content).hexdigest())
-        _write(staging / "tensors.safetensors", content)
-        _write(staging / "checkpoint.json", _canonical(record))
+        write_file(staging / "tensors.safetensors", content)
+        write_record(staging / "checkpoint.json", record)
         target = folder / f"step_{step:09d}"
         if target.exists():
             shutil.rmtree(target)
         staging.rename(target)
-        _sync(folder)
+        sync_folder(folder)
         left_over = list(folder.glob(".staging-*"))  # of a run killed while it saved
         for old in (*left_over, *(each.folder for each in self.checkpoints()[:-KEPT])):
             shutil.rmtree(old)
@@ -173,42 +171,21 @@ def open_run(folder: str | Path) -> Run:
     folder = Path(folder)
     if not (folder / "run.json").is_file():
         raise CheckpointError(f"{folder} is no run: it has no run.json; `tcmrl train` makes one")
-    return Run(folder, _read(RunRecord, folder / "run.json"))
+    return Run(folder, read_record(RunRecord, folder / "run.json"))
 
 
 def write_run(folder: Path, record: RunRecord) -> Run:
     """Writes `run.json`, replacing an older one at once."""
     folder.mkdir(parents=True, exist_ok=True)
-    temporary = folder / f".run-{uuid.uuid4().hex}.json"
-    _write(temporary, _canonical(record))
-    os.replace(temporary, folder / "run.json")
-    _sync(folder)
+    write_record(folder / "run.json", record)
     return Run(folder, record)
 
 
-def _read(kind: type[Record], file: Path) -> Record:
-    try:
-        return kind.model_validate_json(file.read_bytes())
-    except OSError as error:
-        raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
-    except ValidationError as error:
-        raise CheckpointError(f"{file}: {first_problem(error)}") from None
-
-
-def _canonical(record: BaseModel) -> bytes:
-    return (json.dumps(record.model_dump(mode="json"), indent=1, sort_keys=True) + "\n").encode()
-
-
-def _write(file: Path, content: bytes) -> None:
-    with file.open("xb") as stream:
-        stream.write(content)
-        stream.flush()
-        os.fsync(stream.fileno())
-
-
-def _sync(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)
+def digest(tensors: Mapping[str, Tensor]) -> str:
+    """sha256 over names, types and bytes of tensors, sorted by name."""
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].cpu().contiguous()
+        total.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        total.update(tensor.numpy().tobytes())
+    return total.hexdigest()

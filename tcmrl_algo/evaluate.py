@@ -1,7 +1,7 @@
 """Meta-testing: adapts a trained run to the test tasks and scores it against its controls."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
@@ -170,19 +170,30 @@ def _results(arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Adaptati
 def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) -> list[Context]:
     """As many contexts of other tasks as the task has of its own; at least one of each lender.
 
-    Up to MOST_OTHERS other test tasks, evenly spaced, lend in turn what they were adapted by; a lone test
-    task borrows stored trajectories of training tasks.
+    Up to MOST_OTHERS other test tasks, evenly spaced, lend in turn what they were adapted by, unless the
+    task was adapted by the same (two may keep one training task's context under `idaq`). Where none is
+    left, training tasks lend stored trajectories.
     """
     num_own = len(own[task.index])
-    others: list[list[Context]] = [contexts for index, contexts in own.items() if index != task.index]
+    of_task = {_key(context) for context in own[task.index]}
+
+    def foreign(lenders: Iterable[list[Context]]) -> list[list[Context]]:
+        return [contexts for contexts in lenders if of_task.isdisjoint(map(_key, contexts))]
+
+    others = foreign(contexts for index, contexts in own.items() if index != task.index)
     if not others:
-        others = [
+        others = foreign(
             [arena.stored(each, draw=draw) for draw in range(num_own)] for each in arena.dataset.train_tasks
-        ]
+        )
     spread = np.linspace(0, len(others) - 1, min(MOST_OTHERS, len(others))).round().astype(int)
     chosen = [others[index] for index in spread]
     lanes = range(max(num_own, len(chosen)))
     return [chosen[lane % len(chosen)][lane // len(chosen)] for lane in lanes]
+
+
+def _key(context: Context) -> tuple[int, ...]:
+    """Tells contexts apart by the trajectories that they hold."""
+    return tuple(id(trajectory) for trajectory in context)
 
 
 def _final_episodes(

@@ -250,15 +250,17 @@ def policy_loss(
     return (entropy * log_probabilities - q_values).mean()
 
 
-def dual_divergence(behavior: Float[Tensor, " rows"], policy: Float[Tensor, " rows"]) -> Scalar:
-    """BRAC's dual estimate of KL(pi || behavior): mean(log softplus(c_p)) - mean(softplus(c_b)) + 1.
+def dual_divergence(
+    behavior: Float[Tensor, " rows"], policy: Float[Tensor, " rows"]
+) -> Float[Tensor, " rows"]:
+    """BRAC's dual estimate of KL(pi || behavior) at each state: log softplus(c_p) - softplus(c_b) + 1.
 
     Args:
         behavior: dual critic at stored actions, c_b.
         policy: dual critic at the policy's actions, c_p. softplus(c) estimates pi / behavior.
     """
     ratio = functional.softplus(policy).clamp(min=1e-12)  # log of an underflowed ratio would be -inf
-    return torch.log(ratio).mean() - functional.softplus(behavior).mean() + 1.0
+    return torch.log(ratio) - functional.softplus(behavior) + 1.0
 
 
 def gradient_penalty(gradients: Float[Tensor, "rows inputs"]) -> Scalar:

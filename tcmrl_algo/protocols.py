@@ -142,7 +142,10 @@ class Arena:
 
 
 def adapt_paper(arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
-    """The paper's protocol (section 4.2): random episodes, then the policy under a growing context."""
+    """The paper's protocol (section 4.2): random episodes, then the policy under a growing context.
+
+    Deviation: the policy acts by its most likely action in the second stage too, without noise.
+    """
     settings = arena.settings
     num_random = min(settings.random_episodes, settings.episodes)
     collected: list[list[Trajectory]] = [[] for _ in tasks]
@@ -187,9 +190,9 @@ def adapt_idaq(arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
             tried = [[trajectory] if trajectory else [] for trajectory in best]
         trajectories = arena.adapted(tasks, tried, episode=episode)
         for lane, trajectory in enumerate(trajectories):
-            returns[lane].append(trajectory.undiscounted_return)
-            if returns[lane][-1] == max(returns[lane]):
+            if trajectory.undiscounted_return > max(returns[lane], default=-np.inf):
                 kept[lane], best[lane] = tried[lane], trajectory
+            returns[lane].append(trajectory.undiscounted_return)
     return [Adaptation(returns[lane], [kept[lane]]) for lane in range(len(tasks))]
 
 

@@ -1,6 +1,5 @@
 """Meta-training: a dataset and a resolved configuration in, a run's folder out."""
 
-import hashlib
 import importlib.metadata
 import math
 import sys
@@ -13,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tcmrl_algo.batches import Batches, open_batches
-from tcmrl_algo.checkpoint import Run, RunRecord, open_run, write_run
+from tcmrl_algo.checkpoint import Run, RunRecord, digest, open_run, write_run
 from tcmrl_algo.config import ALGORITHMS, TrainingConfig, validated
 from tcmrl_algo.memory import keep_freed_memory
 from tcmrl_algo.metrics import MetricsWriter
@@ -116,7 +115,7 @@ def train_run(
     if (Path(out) / "run.json").exists():
         raise CheckpointError(f"{out} holds a run already; go on with --resume, or name another --out")
     batches = open_batches(
-        dataset, config, seed=seed, device=_device(device), memory_limit=memory_limit, say=say
+        dataset, config, seed=seed, device=usable_device(device), memory_limit=memory_limit, say=say
     )
     record = RunRecord(
         environment=dataset.name,
@@ -171,7 +170,7 @@ def resume_run(
         dataset,
         record.config,
         seed=record.seed,
-        device=_device(record.device),
+        device=usable_device(record.device),
         memory_limit=memory_limit,
         say=say,
     )
@@ -194,7 +193,7 @@ def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
         record.moments,
         seed=record.seed,
         steps=settings.run.steps,
-        device=_device(record.device),
+        device=usable_device(record.device),
     )
     module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
     config = validated(module.Config, record.config.method, f"[{settings.run.algorithm}]")
@@ -202,14 +201,19 @@ def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
     return algorithm
 
 
-def digest(tensors: Mapping[str, Tensor]) -> str:
-    """sha256 over names, types and bytes of tensors, sorted by name."""
-    total = hashlib.sha256()
-    for name in sorted(tensors):
-        tensor = tensors[name].cpu().contiguous()
-        total.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
-        total.update(tensor.numpy().tobytes())
-    return total.hexdigest()
+def usable_device(name: str) -> torch.device:
+    """The torch device of a name, tried out.
+
+    Raises:
+        TrainingError: it cannot be used here.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise TrainingError(f"--device {name!r} cannot be used here: {reason}") from None
+    return device
 
 
 def _train(
@@ -273,13 +277,3 @@ def _check_finite(values: Mapping[str, Tensor], step: int) -> None:
         return
     name = next(name for name, finite in zip(values, bad, strict=True) if not finite)
     raise TrainingError(f"{name} is not finite at step {step}; {REMEDY}")
-
-
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device)
-    except (RuntimeError, AssertionError) as error:
-        reason = str(error).splitlines()[0]
-        raise TrainingError(f"--device {name!r} cannot be used here: {reason}") from None
-    return device

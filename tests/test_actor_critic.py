@@ -5,6 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tcmrl_algo import actor_critic as module
 from tcmrl_algo.actor_critic import ActorCritic, ActorCriticSettings, value_bounds
 from tests.made_up import TASKS, problem, steps
 
@@ -73,6 +74,37 @@ def test_dual_critic_tells_a_far_policy_from_behavior_and_alpha_rises() -> None:
     actor_critic.after_step()
     assert actor_critic.brac is not None
     assert actor_critic.brac.alpha.item() > 1.0
+
+
+def test_value_mode_lowers_each_states_target_by_its_own_divergence(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: dict[str, list[torch.Tensor]] = {}
+
+    def spy(name: str, place: int) -> None:
+        real = getattr(module, name)
+
+        def call(*arguments: torch.Tensor, **named: float) -> torch.Tensor:
+            result: torch.Tensor = real(*arguments, **named)
+            seen.setdefault(name, []).append(result if place < 0 else arguments[place])
+            return result
+
+        monkeypatch.setattr(module, name, call)
+
+    spy("value_loss", 1)  # the targets of V
+    spy("q_loss", 3)  # V(s'), as Q's targets see it
+    spy("dual_divergence", -1)
+    for mode in ("policy", "value"):
+        made = ActorCriticSettings.model_validate({"hidden": (8,), "brac": {"mode": mode, "alpha": 7.0}})
+        actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
+        with torch.no_grad():
+            actor_critic.target_value.layers[-1].bias.fill_(-1e6)
+        rows = actor_critic.rows(steps(TASKS, 5, seed=1), torch.zeros(TASKS, 0))
+        actor_critic.losses(rows, torch.Generator().manual_seed(0))
+    without, with_penalty = seen["value_loss"]
+    divergences = seen["dual_divergence"][1]
+    torch.testing.assert_close(without - with_penalty, 7.0 * divergences)
+    assert divergences.std() > 0
+    lowest = actor_critic.bounds[0]  # of what rewards add up to; a penalised value may lie below
+    assert (seen["q_loss"][0] == lowest).all() and (seen["q_loss"][1] < lowest).all()
 
 
 def test_the_limit_of_q_is_a_multiple_of_what_rewards_allow() -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from tcmrl_algo import Summary, summarize
+from tcmrl_algo.aggregate import mean_interval
 from tcmrl_data import TrainingError
 
 
@@ -13,7 +14,7 @@ def test_fewer_than_five_seeds_get_no_interval_but_stand_there() -> None:
     found = summarize([1.0, 2.0, 6.0, 3.0])
     assert (found.low, found.high) == (None, None)
     assert (found.mean, found.iqm) == (3.0, 2.5)  # without 1 and 6
-    assert str(found) == "3 (seeds: 1, 2, 6, 3)"
+    assert mean_interval(found.values) is None
 
 
 def test_interval_is_that_of_all_equally_likely_resamples() -> None:
@@ -25,7 +26,14 @@ def test_interval_is_that_of_all_equally_likely_resamples() -> None:
     assert found.high == pytest.approx(high, abs=0.2)
     assert found.mean == 4.0
     assert found.iqm == pytest.approx(7 / 3)
-    assert str(found) == f"4 [{found.low:.3g}, {found.high:.3g}]"
+
+
+def test_verdicts_intervals_hold_the_mean_as_often_as_they_say() -> None:
+    draws = np.random.default_rng(0).normal(size=(2_000, 5))
+    intervals = [mean_interval(each.tolist()) for each in draws]
+    held = np.mean([low <= 0.0 <= high for low, high in filter(None, intervals)])
+    assert 0.94 < held < 0.96
+    assert mean_interval([2.0] * 5) == (2.0, 2.0)
 
 
 def test_a_summary_is_a_function_of_its_values() -> None:

@@ -127,7 +127,7 @@ def test_packed_trajectories_keep_their_steps_and_mask_the_rest() -> None:
 
 def test_no_context_needs_no_trajectories() -> None:
     assert no_context.batch_sizes(settings()) == BatchSizes(
-        tasks=TASKS, transitions=5, context_trajectories=(1,), execution_trajectories=0, window_length=2
+        tasks=TASKS, transitions=5, context_trajectories=(0,), execution_trajectories=0, window_length=2
     )
 
 

@@ -170,6 +170,27 @@ def test_idaq_keeps_a_training_context_that_nothing_beats(two_tests: Dataset) ->
         assert adaptation.returns[0] == max(adaptation.returns)
 
 
+def test_idaq_keeps_the_first_of_equal_contexts(two_tests: Dataset) -> None:
+    class Indifferent(GoalReader):
+        def adapt(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
+            return GoalController(np.array([[0.0, 1.0]] * len(trajectories)))
+
+    place = arena(two_tests, Indifferent(), episodes=5)
+    first = place.stored(two_tests.train_tasks[0], draw=0)
+    for adaptation in PROTOCOLS["idaq"](place, two_tests.test_tasks):
+        assert len(set(adaptation.returns)) == 1
+        assert adaptation.contexts[0] == first
+
+
+def test_a_context_that_two_tasks_keep_is_not_another_tasks(two_tests: Dataset) -> None:
+    place = arena(two_tests, GoalReader(), offline_trajectories=2)
+    tests = two_tests.test_tasks
+    shared = place.stored(two_tests.train_tasks[0], draw=0)
+    own = {task.index: [shared] for task in tests}
+    (borrowed,) = contexts_of_others(place, tests[0], own)[:1]
+    assert all(each is not mine for each in borrowed for mine in shared)
+
+
 def test_contexts_of_others_are_never_the_tasks_own(two_tests: Dataset, tiny: Dataset) -> None:
     place = arena(two_tests, GoalReader(), offline_trajectories=2)
     tests = two_tests.test_tasks

@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -14,10 +15,12 @@ import pytest
 from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
-from tcmrl_algo import experiment_names, load_experiment, open_run, resolve, run_experiment, train_run
-from tcmrl_algo.experiment.config import Experiment, override_texts, read_experiment
+from tcmrl_algo import experiment_names, load_experiment, open_run, run_experiment, train_run
+from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.driver import Finished
-from tcmrl_algo.experiment.results import RunResult, read_record
+from tcmrl_algo.experiment.plan import resolve_method
+from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.records import read_record
 from tcmrl_data import TcmrlError, TrainingError
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
@@ -101,6 +104,21 @@ def test_other_settings_or_data_are_refused_by_name(
         run_experiment(_small(tiny_folder), other)
 
 
+def test_one_folder_never_holds_two_settings_of_a_method(
+    finished: Path, tiny_folder: Path, tmp_path: Path, call: Call
+) -> None:
+    file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
+    new = ["experiment", file, "--out", finished, "--seeds", "7"]
+    assert_refused(call(*new, "--steps", 80), "run.steps 40", "80")
+    changed = experiments.tables(tiny_folder)
+    changed["methods"]["no context"]["training"]["run"]["log_every"] = 5
+    file = experiments.write_file(tmp_path / "changed.toml", changed)
+    assert_refused(
+        call("experiment", file, "--out", finished, "--seeds", "7", "--only", "TCMRL"), "log_every 20"
+    )
+    assert {each.stem for each in finished.glob("runs/*.json")} == FILES
+
+
 def test_only_and_seeds_choose_runs_and_the_table_keeps_the_rest(
     finished: Path, tiny_folder: Path, tmp_path: Path, call: Call
 ) -> None:
@@ -134,6 +152,8 @@ def test_only_and_seeds_choose_runs_and_the_table_keeps_the_rest(
         ),
         ({"environments": {"point-robot": {"profile": "fast"}}}, ["fast", "quick"]),
         ({"environments": {"half-cheetah-vel": {}}}, ["half-cheetah-vel"]),
+        ({"training": {"run": {"snapshots": "steps>=9999"}}}, ["9999"]),
+        ({"training": {"run": {"context_snapshots": "best"}}}, ["best"]),
     ],
     ids=str,
 )
@@ -161,37 +181,62 @@ def test_every_shipped_experiment_resolves_on_the_recipes_of_its_environments(na
     assert experiment.name == name
     assert len(experiment.seeds) >= 5
     for environment, choice in experiment.environments.items():
-        tables = dict(tcmrl_data.load_recipe(environment).training)
-        table = tables[choice.profile or "paper"]  # type: ignore[index]
-        for label, method in experiment.methods.items():
-            texts = [
-                text
-                for each in (experiment.training, choice.training, method.training)
-                for text in override_texts(each)
-            ]
-            config = resolve(table, place=f"{name}, {label}", algorithm=method.algorithm, overrides=texts)
-            assert config.settings.run.steps >= experiment.curve_points
+        table = dict(tcmrl_data.load_recipe(environment).training)[choice.profile or "paper"]  # type: ignore[index]
+        configs = [
+            resolve_method(experiment, table, environment=environment, label=label, place=name)
+            for label in experiment.methods
+        ]
+        assert len({each.model_dump_json() for each in configs}) == len(configs)  # no two are the same
 
 
-def test_no_two_methods_of_a_shipped_experiment_are_the_same() -> None:
-    for name in experiment_names():
-        experiment = load_experiment(name)
-        kinds = [json.dumps(each.model_dump(), sort_keys=True) for each in experiment.methods.values()]
-        assert len(set(kinds)) == len(kinds), name
+def test_a_methods_changes_go_over_the_environments_over_the_experiments(tiny_folder: Path) -> None:
+    content = experiments.tables(tiny_folder)
+    table = dict(tcmrl_data.load_recipe("point-robot").training)["quick"]
+
+    def latent() -> Any:
+        made = read_experiment(content, place="test")
+        config = resolve_method(made, table, environment="point-robot", label="TCMRL", place="test")
+        return config.method["latent"]
+
+    assert latent() == 4  # the experiment's
+    content["environments"]["point-robot"]["training"] = {"tcmrl": {"latent": 5}}
+    assert latent() == 5
+    content["methods"]["TCMRL"]["training"] = {"tcmrl": {"latent": 6}}
+    assert latent() == 6
 
 
 def test_a_failed_run_is_told_and_tried_again(tiny_folder: Path, tmp_path: Path, call: Call) -> None:
     content = experiments.tables(tiny_folder, seeds=[0])
     content["methods"] |= {
-        "broken": {"algorithm": "tcmrl", "training": {"run": {"snapshots": "steps>=9999"}}}
+        "broken": {"algorithm": "tcmrl", "training": {"optimizer": {"learning_rate": 1e6}}}
     }
     file = experiments.write_file(tmp_path / "small.toml", content)
-    arguments = ["experiment", file, "--out", tmp_path / "out", "--only", "broken"]
-    code, _, errors = call(*arguments)
+    out = tmp_path / "out"
+    arguments = ["experiment", file, "--out", out, "--only", "broken"]
+    code, output, errors = call(*arguments)
     assert code == 1
-    assert "9999" in errors and "tries again" in errors
-    assert not list((tmp_path / "out").glob("runs/*.json"))
+    assert "at step" in errors and "tries again" in errors
+    assert "Next:" not in output + errors
+    assert not list(out.glob("runs/*.json"))
+    assert "at step" in (out / "runs/point-robot--broken--seed0/error.txt").read_text()
     assert call(*arguments, "--quiet")[0] == 1
+
+
+def test_what_never_began_takes_a_new_device_and_new_threads(
+    tiny_folder: Path, tmp_path: Path, call: Call
+) -> None:
+    file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
+    arguments = ["experiment", file, "--out", tmp_path / "out", "--only", "TCMRL", "--seeds", "0"]
+    assert_refused(call(*arguments, "--device", "cudda"), "--device 'cudda'")
+    assert not (tmp_path / "out").exists()
+    job = tmp_path / "out/runs/point-robot--tcmrl--seed0/job.json"
+    cores = len(os.sched_getaffinity(0))
+    for workers in (cores, 1):  # the first is killed before its run begins
+        assert call(*arguments, "--workers", workers)[0] == 0
+        assert json.loads(job.read_text())["config"]["settings"]["run"]["threads"] == cores // workers
+        shutil.rmtree(job.parent / "checkpoints")
+        (job.parent / "run.json").unlink()
+        job.parent.with_name(f"{job.parent.name}.json").unlink()
 
 
 @pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])

@@ -16,11 +16,12 @@ from tcmrl_cli.train import tcmrl
 import tcmrl_data
 from tcmrl_algo import Report, open_run, run_experiment, write_report
 from tcmrl_algo.experiment.config import Claim, read_experiment
-from tcmrl_algo.experiment.results import RunResult, read_record
+from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.records import read_record
 from tcmrl_algo.reporting.claims import Verdict, judge, measure_result
 from tcmrl_algo.reporting.contexts import Stored, TrainedContexts, distance_ratio, embed
 from tcmrl_algo.reporting.sections import attention_table, final_table, published, published_table
-from tcmrl_algo.reporting.sources import FinishedRun, read_sources
+from tcmrl_algo.reporting.sources import FinishedRun, labels_of, read_sources
 from tcmrl_algo.reporting.tables import Table, across_seeds
 from tcmrl_data import Dataset
 from tests import experiments
@@ -89,6 +90,7 @@ def _judge(claim: Claim, runs: list[FinishedRun]) -> Verdict:
         ([2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 2.0, 3.0, 4.0, 5.0], "final", "supported"),
         ([1.0, 2.0, 3.0, 4.0, 5.0], [2.0, 3.0, 4.0, 5.0, 6.0], "final", "contradicted"),
         ([1.0, 5.0, 1.0, 5.0, 1.0], [5.0, 1.0, 5.0, 1.0, 1.0], "final", "cannot tell"),
+        ([0.1, 1.4, 0.1, 0.6, 0.5], [0.0, 0.0, 0.0, 0.0, 0.0], "final", "cannot tell"),  # by bootstrap not
         ([9.0, 9.0, 9.0, 9.0], [1.0, 1.0, 1.0, 1.0], "final", "cannot tell"),  # too few seeds
         ([2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 2.0, 3.0, 4.0, 5.0], "regret", "supported"),  # lower is better
     ],
@@ -191,6 +193,8 @@ def test_tables_are_markdown_and_csv() -> None:
 def test_the_paper_stands_beside_ours_where_the_unit_is_the_same(trained: FinishedRun) -> None:
     assert published_table("p", "point-robot", [trained.result]) is None
     assert published_table("p", "ml1/reach", [trained.result]) is None
+    ours = trained.result.model_copy(update={"method": "a method of ours"})
+    assert published_table("p", "half-cheetah-vel", [ours]) is None
     table = published_table("p", "half-cheetah-vel", [trained.result])
     assert table is not None
     rows = {row[0]: row for row in table.rows}
@@ -202,9 +206,9 @@ def test_the_paper_stands_beside_ours_where_the_unit_is_the_same(trained: Finish
 
 def test_a_report_holds_every_section_and_every_file_it_names(report: Report, results: Path) -> None:
     text = report.report.read_text()
-    for heading in ("Claims", "Learning curves", "Time and memory", "Contexts", "Attention", "Digests"):
+    for heading in ("Claims", "Learning curves", "Time and memory", "Contexts", "Attention"):
         assert f"# {heading}" in text
-    assert set(re.findall(r"\]\((.+?)\)", text)) == {
+    assert set(re.findall(r"\]\((.+?\.png)\)", text)) == {
         each.name for each in report.files if each.suffix == ".png"
     }
     assert {each.name for each in report.report.parent.iterdir()} == {each.name for each in report.files}
@@ -213,7 +217,9 @@ def test_a_report_holds_every_section_and_every_file_it_names(report: Report, re
         if file.suffix == ".png":
             assert file.read_bytes().startswith(PNG)
     result = read_record(RunResult, results / "runs/point-robot--tcmrl--seed0.json")
-    assert result.root in text and result.digest in text
+    assert result.root in text
+    (digests,) = (each for each in report.files if each.name.endswith("-digests.csv"))
+    assert digests.name in text and result.digest in digests.read_text()
     table = final_table("x", [result])
     assert f"{table.rows[0][3]:.4g}" in text
     assert [each.verdict for each in report.verdicts] == ["cannot tell"] * 2
@@ -266,6 +272,16 @@ def test_a_report_without_checkpoints_says_what_is_left_out(copy: Path, call: Ca
     assert "are left out: " in text and "is no run" in text and "Time and memory" in text
 
 
+def test_a_report_names_the_runs_that_are_missing_and_why(copy: Path) -> None:
+    lost = copy / "runs/point-robot--no-context--seed0"
+    lost.with_name(f"{lost.name}.json").unlink()
+    lost.mkdir()
+    (lost / "error.txt").write_text("loss/critic is not finite at step 7\n")
+    text = write_report([copy], copy / "report").report.read_text()
+    assert f"1 of its runs, `{lost.name}` (loss/critic is not finite at step 7)" in text
+    assert "| 0 |" in text  # seeds of the claim that it was part of
+
+
 def test_what_is_no_run_is_refused(results: Path, tmp_path: Path, call: Call) -> None:
     assert_refused(call("report", tmp_path), "experiment.json", "run.json")
     shutil.copy(results / "experiment.json", tmp_path)
@@ -283,6 +299,15 @@ def test_runs_of_one_algorithm_with_other_settings_are_told_apart(results: Path,
     (other / "run.json").write_text(json.dumps(record))
     (source,) = read_sources([first, other], lambda stage, done, total: None)
     assert list(source.experiment.methods) == [f"tcmrl {first.name}", "tcmrl other"]
+    second = tmp_path / "second"
+    for field, value, labels in (
+        ("seed", 1, ["tcmrl"]),
+        ("root", "0" * 64, [f"tcmrl {first.name}", "tcmrl second"]),
+    ):
+        record = json.loads((first / "run.json").read_text()) | {"seed": 1, field: value}
+        shutil.copytree(first, second, dirs_exist_ok=True)
+        (second / "run.json").write_text(json.dumps(record))
+        assert list(dict.fromkeys(labels_of([open_run(first), open_run(second)]))) == labels
     torch.testing.assert_close(
         open_run(first).newest().tensors(), open_run(other).newest().tensors(), rtol=0, atol=0
     )

@@ -1,6 +1,7 @@
 """Training: configuration, determinism, resuming, checkpoints, metrics, and `tcmrl train`."""
 
 import json
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -9,12 +10,14 @@ from typing import Any
 
 import pytest
 import torch
+from pydantic import BaseModel
 from tcmrl_cli.train import tcmrl
 
 import tcmrl_algo
 from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
-from tcmrl_algo.batches import JoinedBatches
-from tcmrl_algo.config import ALGORITHMS, TrainingSettings
+from tcmrl_algo.actor_critic import ActorCriticSettings, BracSettings
+from tcmrl_algo.algorithms import tcmrl as tcmrl_module
+from tcmrl_algo.config import ALGORITHMS, OptimizerSettings, RunSettings, TrainingSettings
 from tcmrl_algo.train import Progress
 from tcmrl_data import BatchSizes, CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
 from tcmrl_data.discovery import modules
@@ -286,22 +289,6 @@ def test_contexts_may_come_from_other_snapshots_than_transitions(start: Train, t
     assert len(digests) == 4
 
 
-def test_joined_batches_take_each_kind_from_its_selection(tiny: Dataset) -> None:
-    last, whole = (tiny.select(split="train", snapshots=each) for each in ("last", "all"))
-    stored = [each for task in last.tasks for each in last.trajectories(task.index)]
-    own = {float(reward) for each in stored for reward in each.rewards}
-    sizes = BatchSizes(tasks=3, transitions=9, context_trajectories=(1, 2), windows=2)
-    none = sizes.model_copy(update={"context_trajectories": (0,), "execution_trajectories": 0, "windows": 0})
-    joined = JoinedBatches(last.sampler(none, seed=0), whole.sampler(sizes, seed=0))
-    batches = [joined.batch(n) for n in range(10)]
-    assert all(each.transitions.rewards.shape == (3, 9) for each in batches)
-    assert all(set(each.transitions.rewards.flatten().tolist()) <= own for each in batches)
-    for part in ("context", "execution", "windows"):
-        seen = {value for each in batches for value in getattr(each, part).rewards.flatten().tolist()}
-        assert not seen <= own, part
-    assert joined.moments().reward_mean == last.sampler(sizes, seed=0).moments().reward_mean
-
-
 def test_progress_is_reported_with_rates(start: Train) -> None:
     seen: list[Progress] = []
     start("run", steps=25, report=seen.append)
@@ -409,8 +396,19 @@ def test_public_names_load() -> None:
         tcmrl_algo.nothing  # noqa: B018
 
 
-def test_run_settings_fields_are_documented() -> None:
-    from tcmrl_algo.config import RunSettings
-
-    for name in RunSettings.model_fields:
-        assert f"{name}:" in (RunSettings.__doc__ or "")
+@pytest.mark.parametrize(
+    "table",
+    [
+        RunSettings,
+        OptimizerSettings,
+        BatchSizes,
+        ActorCriticSettings,
+        BracSettings,
+        tcmrl_module.Config,
+        tcmrl_module.Weights,
+    ],
+    ids=lambda table: table.__name__,
+)
+def test_every_setting_is_documented(table: type[BaseModel]) -> None:
+    documented = re.findall(r"^\s+([\w, ]+): ", table.__doc__ or "", re.MULTILINE)
+    assert set(table.model_fields) <= {name for line in documented for name in line.split(", ")}

@@ -29,7 +29,7 @@ class Config(BaseModel):
 
 def batch_sizes(settings: TrainingSettings) -> BatchSizes:
     """The `[training.batch]` table without the trajectories that nothing here reads."""
-    unused = {"context_trajectories": (1,), "execution_trajectories": 0, "windows": 0}
+    unused = {"context_trajectories": (0,), "execution_trajectories": 0, "windows": 0}
     return settings.batch.model_copy(update=unused)
 
 

@@ -9,18 +9,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_algo.config import TrainingConfig
-from tcmrl_algo.experiment.config import Experiment
-from tcmrl_algo.experiment.job import Job, result_file
+from tcmrl_algo.experiment.config import Experiment, run_id
+from tcmrl_algo.experiment.job import Job
 from tcmrl_algo.experiment.plan import PlannedRun, check_same, plan_runs
-from tcmrl_algo.experiment.results import (
-    RunResult,
-    read_record,
-    read_results,
-    table_text,
-    write_record,
-    write_text,
-)
-from tcmrl_data import CheckpointError, Unit, plugin
+from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file, table_text
+from tcmrl_algo.records import read_record, write_file, write_record
+from tcmrl_algo.train import usable_device
+from tcmrl_data import CheckpointError, TrainingError, Unit, plugin
 
 WORKER = "tcmrl_algo.experiment.job"
 
@@ -103,10 +98,13 @@ def run_experiment(
         >>> run_experiment(experiment, "results/figure5", workers=2).results  # doctest: +SKIP
     """
     began, out, cores = time.perf_counter(), Path(out), len(os.sched_getaffinity(0))
-    plan = plan_runs(experiment, data=Path(data), only=only, seeds=seeds, steps=steps)
+    usable_device(device)
+    every = plan_runs(experiment, data=Path(data), seeds=seeds, steps=steps)
+    before = _finished(every, out, experiment)
+    plan = _chosen(every, experiment, only)
     workers = workers or cores
     threads = max(1, cores // workers)
-    found = {run.id: _finished(run, out) for run in plan}
+    found = {run.id: before.get(run.id) for run in plan}
     jobs = {
         run.id: _job(run, experiment, out, threads=threads, device=device)
         for run in plan
@@ -115,47 +113,65 @@ def run_experiment(
     out.mkdir(parents=True, exist_ok=True)
     failed: list[str] = []
     with _lock(out):
-        write_text(out / "experiment.json", experiment.model_dump_json(indent=1, by_alias=True) + "\n")
+        write_record(out / "experiment.json", experiment)
         for job in jobs.values():
             Path(job.folder).mkdir(parents=True, exist_ok=True)
             write_record(Path(job.folder) / "job.json", job)
+            error_file(Path(job.folder)).unlink(missing_ok=True)
         present = len(plan) - len(jobs)
         _write_table(out, experiment)
-        for run_id, error in _run(jobs, workers):
-            result = None if error else read_record(RunResult, result_file(out / "runs" / run_id))
-            found[run_id] = result
+        for name, error in _run(jobs, workers):
+            folder = out / "runs" / name
+            result = None if error else read_record(RunResult, result_file(folder))
+            found[name] = result
             if error:
-                failed.append(f"{run_id}: {error}")
+                failed.append(f"{name}: {error}")
+                write_file(error_file(folder), f"{error}\n".encode())
             _write_table(out, experiment)
             ended = sum(each is not None for each in found.values()) + len(failed)
             pace = (time.perf_counter() - began) / (ended - present)
-            report(Finished(run_id, result, error, ended, len(plan), pace * (len(plan) - ended)))
+            report(Finished(name, result, error, ended, len(plan), pace * (len(plan) - ended)))
     results = tuple(each for each in found.values() if each is not None)
     return ExperimentReport(out, results, present, tuple(failed), time.perf_counter() - began)
 
 
-def _finished(run: PlannedRun, out: Path) -> RunResult | None:
-    """The result of a run that is done.
+def _chosen(plan: Sequence[PlannedRun], experiment: Experiment, only: Sequence[str]) -> list[PlannedRun]:
+    """The runs of the methods of these labels; all where there are none.
 
     Raises:
-        CheckpointError: it was done with other settings or data.
+        TrainingError: no method has such a label.
     """
-    file = result_file(out / "runs" / run.id)
-    if not file.is_file():
-        return None
-    result = read_record(RunResult, file)
-    check_same(result.identity, run.identity(), place=file)
-    return result
+    unknown = [label for label in only if label not in experiment.methods]
+    if unknown:
+        known = ", ".join(map(repr, experiment.methods))
+        raise TrainingError(f"--only {unknown[0]!r}: {experiment.name} has no such method; they are {known}")
+    return [run for run in plan if not only or run.method in only]
+
+
+def _finished(plan: Sequence[PlannedRun], out: Path, experiment: Experiment) -> dict[str, RunResult]:
+    """Results that the folder holds, by run, of other seeds than the planned ones too.
+
+    Raises:
+        CheckpointError: one of them differs from the planned runs in more than its seed.
+    """
+    planned = {(run.environment, run.method): run.identity() for run in plan}
+    found = {}
+    for result in read_results(out, experiment):
+        name = run_id(result.environment, result.method, result.seed)
+        identity = planned.get((result.environment, result.method), result.identity)
+        check_same(result.identity, identity | {"seed": result.seed}, place=result_file(out / "runs" / name))
+        found[name] = result
+    return found
 
 
 def _job(run: PlannedRun, experiment: Experiment, out: Path, *, threads: int, device: str) -> Job:
-    """What a worker is told of a run; one that was begun keeps its threads and device.
+    """What a worker is told of a run; one that has begun training keeps its threads and device.
 
     Raises:
         CheckpointError: it was begun with other settings or data.
     """
     folder = (out / "runs" / run.id).resolve()
-    if (folder / "job.json").is_file():
+    if (folder / "run.json").is_file() and (folder / "job.json").is_file():
         before = read_record(Job, folder / "job.json")
         check_same(before.identity, run.identity(), place=folder)
         threads, device = before.config.settings.run.threads, before.device
@@ -182,12 +198,12 @@ def _run(jobs: dict[str, Job], workers: int) -> Iterator[tuple[str, str | None]]
     """Runs end in any order, each with its error or None; closing the iterator ends what still runs."""
     units = [
         Unit(
-            run_id,
+            name,
             job.model_dump(mode="json"),
             worker=WORKER,
             threads=job.config.settings.run.threads,
         )
-        for run_id, job in jobs.items()
+        for name, job in jobs.items()
     ]
     engine = plugin("tcmrl_data.engine", "engine", "local").Engine(workers)
     with contextlib.closing(engine.run(units, lambda unit, message: None)) as results:
@@ -208,4 +224,4 @@ def _lock(out: Path) -> Iterator[None]:
 
 def _write_table(out: Path, experiment: Experiment) -> None:
     rows = [row for result in read_results(out, experiment) for row in result.rows()]
-    write_text(out / "table.csv", table_text(rows))
+    write_file(out / "table.csv", table_text(rows).encode())

@@ -13,11 +13,12 @@ from typing import Any
 import torch
 from pydantic import BaseModel, ConfigDict
 
-from tcmrl_algo.checkpoint import open_run
+from tcmrl_algo.checkpoint import digest, open_run
 from tcmrl_algo.config import Protocol, TrainingConfig
 from tcmrl_algo.evaluate import Evaluation, evaluate_run
-from tcmrl_algo.experiment.results import CurvePoint, RunResult, read_record, write_record
-from tcmrl_algo.train import Progress, digest, resume_run, train_run
+from tcmrl_algo.experiment.results import CurvePoint, RunResult, result_file
+from tcmrl_algo.records import read_record, write_record
+from tcmrl_algo.train import Progress, resume_run, train_run
 from tcmrl_data import CheckpointError, Dataset, open_dataset, serve
 
 Report = Callable[[Mapping[str, Any]], None]
@@ -65,11 +66,6 @@ class Curve(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     points: tuple[CurvePoint, ...] = ()
-
-
-def result_file(folder: Path) -> Path:
-    """Where the result of the run in a folder is written, as its last deed."""
-    return folder.with_name(f"{folder.name}.json")
 
 
 def run_job(job: Job, report: Report) -> str:

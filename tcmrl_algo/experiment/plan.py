@@ -51,7 +51,6 @@ def plan_runs(
     experiment: Experiment,
     *,
     data: Path,
-    only: Sequence[str] = (),
     seeds: Sequence[int] | None = None,
     steps: int | None = None,
 ) -> list[PlannedRun]:
@@ -60,27 +59,19 @@ def plan_runs(
     Args:
         experiment: the file.
         data: folder of datasets, one per environment.
-        only: labels of methods; all where empty.
         seeds: instead of the experiment's.
         steps: training steps instead of `run.steps`, of runs and schedules.
 
     Raises:
-        SelectionError: a dataset is missing, of another environment, or without test tasks.
+        SelectionError: a dataset is missing, of another environment, without test tasks, or without the
+            snapshots that a method asks for.
         TrainingError: an unknown method, algorithm or profile, or changes that do not validate.
     """
-    unknown = [label for label in only if label not in experiment.methods]
-    if unknown:
-        known = ", ".join(map(repr, experiment.methods))
-        raise TrainingError(f"--only {unknown[0]!r}: {experiment.name} has no such method; they are {known}")
     runs = []
     for environment, choice in experiment.environments.items():
         dataset = _dataset(environment, choice, data)
         profile = choice.profile or dataset.manifest.profile
-        configs = {
-            label: _config(experiment, dataset, profile, label, steps)
-            for label in experiment.methods
-            if not only or label in only
-        }
+        configs = {label: _config(experiment, dataset, profile, label, steps) for label in experiment.methods}
         runs += [
             PlannedRun(
                 id=run_id(environment, label, seed),
@@ -134,16 +125,22 @@ def _dataset(environment: str, choice: EnvironmentChoice, data: Path) -> Dataset
     return dataset
 
 
-def _config(
-    experiment: Experiment, dataset: Dataset, profile: str, label: str, steps: int | None
+def resolve_method(
+    experiment: Experiment,
+    table: Mapping[str, Any],
+    *,
+    environment: str,
+    label: str,
+    place: str,
+    steps: int | None = None,
 ) -> TrainingConfig:
-    place = f"experiment {experiment.name!r}, method {label!r} on {dataset.name!r}, profile {profile!r}"
-    table = {str(name): each for name, each in dataset.manifest.training.items()}.get(profile)
-    if table is None:
-        known = ", ".join(dataset.manifest.training)
-        raise TrainingError(f"{place}: the dataset has no such training table; it has {known}")
+    """A method's configuration: the training table, then changes of experiment, environment and method.
+
+    Raises:
+        TrainingError: what results does not validate, or is shorter than the learning curve.
+    """
     method = experiment.methods[label]
-    changes = (experiment.training, experiment.environments[dataset.name].training, method.training)
+    changes = (experiment.training, experiment.environments[environment].training, method.training)
     texts = [text for each in changes for text in override_texts(each)]
     if steps is not None:
         texts.append(f"run.steps={steps}")
@@ -153,6 +150,23 @@ def _config(
             f"{place}: {experiment.curve_points} curve_points need as many steps, not "
             f"{config.settings.run.steps}"
         )
+    return config
+
+
+def _config(
+    experiment: Experiment, dataset: Dataset, profile: str, label: str, steps: int | None
+) -> TrainingConfig:
+    place = f"experiment {experiment.name!r}, method {label!r} on {dataset.name!r}, profile {profile!r}"
+    table = {str(name): each for name, each in dataset.manifest.training.items()}.get(profile)
+    if table is None:
+        known = ", ".join(dataset.manifest.training)
+        raise TrainingError(f"{place}: the dataset has no such training table; it has {known}")
+    config = resolve_method(
+        experiment, table, environment=dataset.name, label=label, place=place, steps=steps
+    )
+    for rule in (config.settings.run.snapshots, config.settings.run.context_snapshots):
+        if rule is not None:
+            dataset.select(split="train", snapshots=rule)
     return config
 
 

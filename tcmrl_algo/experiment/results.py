@@ -2,17 +2,15 @@
 
 import csv
 import io
-import os
-import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.config import TrainingConfig
 from tcmrl_algo.experiment.config import Experiment
-from tcmrl_data import CheckpointError, first_problem
+from tcmrl_algo.records import read_record
 
 COLUMNS = (
     "environment",
@@ -31,7 +29,8 @@ COLUMNS = (
     "root",
     "digest",
 )
-Record = TypeVar("Record", bound=BaseModel)
+AGAIN = "; delete it, and the run is done again"
+"""What helps against a broken result."""
 
 
 class _Record(BaseModel):
@@ -123,35 +122,22 @@ def table_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = COLUM
     return stream.getvalue()
 
 
-def write_text(file: Path, text: str) -> None:
-    """Writes a file whole or not at all, and durably."""
-    temporary = file.with_name(f".{file.name}-{uuid.uuid4().hex}")
-    with temporary.open("x", encoding="utf-8") as stream:
-        stream.write(text)
-        stream.flush()
-        os.fsync(stream.fileno())
-    temporary.replace(file)
+def by_method(results: Iterable[RunResult]) -> dict[str, list[RunResult]]:
+    """Results of every method, in the order given."""
+    found: dict[str, list[RunResult]] = {}
+    for each in results:
+        found.setdefault(each.method, []).append(each)
+    return found
 
 
-def write_record(file: Path, record: BaseModel) -> None:
-    """Writes a record as JSON, whole or not at all."""
-    write_text(file, record.model_dump_json(indent=1) + "\n")
+def result_file(folder: Path) -> Path:
+    """Where the result of the run in a folder is written, as its last deed."""
+    return folder.with_name(f"{folder.name}.json")
 
 
-def read_record(kind: type[Record], file: Path) -> Record:
-    """Takes back what `write_record` wrote.
-
-    Raises:
-        CheckpointError: missing, or not such a record.
-    """
-    try:
-        return kind.model_validate_json(file.read_bytes())
-    except OSError as error:
-        raise CheckpointError(f"{file} cannot be read: {error.strerror}") from None
-    except ValidationError as error:
-        raise CheckpointError(
-            f"{file}: {first_problem(error)}; delete it, and the run is done again"
-        ) from None
+def error_file(folder: Path) -> Path:
+    """Where it is said why the run in a folder failed, until it is tried again."""
+    return folder / "error.txt"
 
 
 def read_results(folder: Path, experiment: Experiment) -> list[RunResult]:
@@ -160,7 +146,7 @@ def read_results(folder: Path, experiment: Experiment) -> list[RunResult]:
     Raises:
         CheckpointError: a result is not what a run writes.
     """
-    results = [read_record(RunResult, file) for file in sorted(folder.glob("runs/*.json"))]
+    results = [read_record(RunResult, file, remedy=AGAIN) for file in sorted(folder.glob("runs/*.json"))]
     order = list(experiment.methods)
     known = [each for each in results if each.method in order]
     return sorted(known, key=lambda each: (each.environment, order.index(each.method), each.seed))

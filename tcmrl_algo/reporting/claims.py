@@ -2,8 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import fmean
 
-from tcmrl_algo.aggregate import summarize
+from tcmrl_algo.aggregate import mean_interval
 from tcmrl_algo.experiment.config import Claim, Metric
 from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.reporting.sources import FinishedRun
@@ -26,7 +27,7 @@ class Verdict:
         seeds: that both sides have.
         differences: one per seed, positive where `better` is better.
         mean: of the differences; None without one.
-        low, high: 95% bootstrap interval of their mean; None under five seeds.
+        low, high: 95% interval of their mean by Student's t; None under five seeds.
         verdict: `supported` where the interval lies above 0, `contradicted` where below, else `cannot tell`.
     """
 
@@ -59,15 +60,14 @@ def judge(
     seeds = tuple(sorted(better.keys() & worse.keys()))
     sign = -1.0 if claim.metric in LOWER_IS_BETTER else 1.0
     differences = tuple(sign * (better[seed] - worse[seed]) for seed in seeds)
-    summary = summarize(differences) if differences else None
-    low, high = (None, None) if summary is None else (summary.low, summary.high)
+    low, high = mean_interval(differences) or (None, None)
     return Verdict(
         claim=claim.text,
         environment=environment,
         comparison=f"{claim.better} ({claim.metric}) against {claim.worse} ({against}), {protocol}",
         seeds=seeds,
         differences=differences,
-        mean=None if summary is None else summary.mean,
+        mean=fmean(differences) if differences else None,
         low=low,
         high=high,
         verdict=_verdict(low, high),

@@ -73,6 +73,9 @@ class TrainedContexts:
         run: whose newest checkpoint is read.
         stored: of the dataset that the run was trained on.
 
+    Attributes:
+        labels: (trajectories,) the task of each, by its place among the stored tasks.
+
     Raises:
         CheckpointError: the run has no checkpoint, or another dataset.
     """
@@ -84,6 +87,7 @@ class TrainedContexts:
         algorithm = create_algorithm(record, stored.dataset)
         algorithm.load_tensors(opened.newest().tensors())
         self._algorithm, self._stored = algorithm, stored
+        self.labels = stored.labels
 
     @cached_property
     def contexts(self) -> FloatArray | None:
@@ -109,7 +113,7 @@ class TrainedContexts:
 
     def distance_ratio(self) -> float | None:
         """Mean distance between contexts of one task over that between contexts of two; below 1 is apart."""
-        return None if self.contexts is None else distance_ratio(self.contexts, self._stored.labels)
+        return None if self.contexts is None else distance_ratio(self.contexts, self.labels)
 
 
 def distance_ratio(contexts: FloatArray, labels: IntArray) -> float | None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from tcmrl_algo.aggregate import summarize
-from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.experiment.results import RunResult, by_method
 from tcmrl_algo.reporting.contexts import FloatArray, IntArray, TransitionWeights
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ WIDTH, HEIGHT = 4.6, 3.6
 def draw_curves(file: Path, title: str, results: Sequence[RunResult], protocol: str) -> None:
     """Mean return of the test tasks over training; intervals from five seeds, else the seeds' own lines."""
     figure, (axes,) = _panels(1, width=1.5 * WIDTH)
-    for index, (method, runs) in enumerate(_by_method(results).items()):
+    for index, (method, runs) in enumerate(by_method(results).items()):
         color = f"C{index % 10}"
         steps = [point.step for point in runs[0].curve]
         finals = [[point.final for point in run.curve] for run in runs]
@@ -43,7 +43,7 @@ def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
     """Final returns per protocol: a line at the mean, dots for seeds, an interval from five seeds."""
     protocols = list(results[0].evaluations)
     figure, panels = _panels(len(protocols))
-    methods = _by_method(results)
+    methods = by_method(results)
     for axes, protocol in zip(panels, protocols, strict=True):
         for place, runs in enumerate(methods.values()):
             summary = summarize([run.evaluations[protocol]["mean_final"] for run in runs])
@@ -58,13 +58,16 @@ def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
 
 
 def draw_embeddings(
-    file: Path, points: Mapping[str, FloatArray], labels: IntArray, is_test: Sequence[bool]
+    file: Path,
+    points: Mapping[str, FloatArray],
+    labels: Mapping[str, IntArray],
+    is_test: Sequence[bool],
 ) -> None:
     """t-SNE of contexts, one panel per method and one colour per task; test tasks are triangles."""
     figure, panels = _panels(len(points))
     for axes, (method, places) in zip(panels, points.items(), strict=True):
         for task, test in enumerate(is_test):
-            own = places[labels == task]
+            own = places[labels[method] == task]
             color = [_color(task, len(is_test))]
             axes.scatter(own[:, 0], own[:, 1], s=14, c=color, marker="^" if test else "o")
         axes.set(title=method, xticks=[], yticks=[])
@@ -103,13 +106,6 @@ def _panels(count: int, *, width: float = WIDTH) -> "tuple[Figure, list[Axes]]":
     for axes in grid:
         axes.grid(alpha=0.3)
     return figure, grid[:count]
-
-
-def _by_method(results: Sequence[RunResult]) -> dict[str, list[RunResult]]:
-    found: dict[str, list[RunResult]] = {}
-    for each in results:
-        found.setdefault(each.method, []).append(each)
-    return found
 
 
 def _draw_references(axes: "Axes", result: RunResult) -> None:

@@ -2,28 +2,20 @@
 
 import importlib.resources
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.experiment.results import RunResult, by_method
 from tcmrl_algo.reporting.claims import Verdict
 from tcmrl_algo.reporting.contexts import TransitionWeights
-from tcmrl_algo.reporting.tables import Cell, Table, across_seeds
+from tcmrl_algo.reporting.tables import Cell, Table, across_seeds, spread
 from tcmrl_data import Dataset, return_table
 
 PAPER_COSTS = ("paper: training s", "paper: MB")
 PAPER_ATTENTION = ("paper: mean", "paper: median")
 PARTS = ("final", "shuffled", "regret", "normalized")
-
-
-def by_method(results: Iterable[RunResult]) -> dict[str, list[RunResult]]:
-    """Results of every method, in the order given."""
-    found: dict[str, list[RunResult]] = {}
-    for each in results:
-        found.setdefault(each.method, []).append(each)
-    return found
 
 
 def final_table(name: str, results: Sequence[RunResult]) -> Table:
@@ -52,9 +44,10 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     """Each claim, the mean difference with its interval or seeds, and the verdict."""
     rows: list[tuple[Cell, ...]] = []
     for each in verdicts:
-        mean, _, spread = across_seeds(each.differences)
-        rows.append((each.claim, each.environment, each.comparison, mean, spread, each.verdict))
-    columns = ("claim", "environment", "compared", "mean difference", "95% interval", "verdict")
+        interval = spread(each.differences, each.low, each.high) if each.seeds else None
+        numbers = (len(each.seeds), each.mean, interval)
+        rows.append((each.claim, each.environment, each.comparison, *numbers, each.verdict))
+    columns = ("claim", "environment", "compared", "seeds", "mean difference", "95% interval", "verdict")
     return Table(name, columns, tuple(rows))
 
 
@@ -66,11 +59,13 @@ def claims_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Table:
 
 
 def published_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
-    """Scores of the paper's Table 2 beside ours, by the method's name; None where the units differ."""
-    scores = published()["returns"].get(environment)
-    if scores is None:
+    """Scores of the paper's Table 2 beside ours, by the method's name.
+
+    None where the units differ, or no method of ours is the paper's.
+    """
+    scores, ours = published()["returns"].get(environment, {}), by_method(results)
+    if not scores.keys() & ours.keys():
         return None
-    ours = by_method(results)
     protocols = list(results[0].evaluations)
     rows: list[tuple[Cell, ...]] = []
     for method in dict.fromkeys((*scores, *ours)):
@@ -90,12 +85,12 @@ def cost_table(name: str, environment: str, results: Sequence[RunResult]) -> Tab
     costs = published()["costs"].get(environment, {})
     rows: list[tuple[Cell, ...]] = []
     for method, runs in by_method(results).items():
-        training, _, spread = across_seeds([run.training_seconds for run in runs])
+        training, _, interval = across_seeds([run.training_seconds for run in runs])
         evaluation = across_seeds([run.evaluation_seconds for run in runs])[0]
         memory = across_seeds([None if run.peak_memory is None else run.peak_memory / 1e6 for run in runs])[0]
         pace = training / runs[0].steps * 1e3 if isinstance(training, float) else None
         printed = costs.get(method, (None, None)) if costs else ()
-        rows.append((method, training, spread, pace, evaluation, memory, *printed))
+        rows.append((method, training, interval, pace, evaluation, memory, *printed))
     columns = ("method", "training s", "95% interval", "ms per step", "evaluation s", "peak MB")
     return Table(name, (*columns, *(PAPER_COSTS if costs else ())), tuple(rows))
 
@@ -120,9 +115,9 @@ def attention_table(
             found = [getattr(each, kind) for each in runs]
             if any(len(each) == 0 for each in found):
                 continue
-            mean, _, spread = across_seeds([float(each.mean()) for each in found])
+            mean, _, interval = across_seeds([float(each.mean()) for each in found])
             median = across_seeds([float(np.median(each)) for each in found])[0]
-            rows.append((method, f"{kind} reward", mean, spread, median, *printed.get(kind, ())))
+            rows.append((method, f"{kind} reward", mean, interval, median, *printed.get(kind, ())))
     columns = ("method", "transitions", "mean", "95% interval", "median")
     return Table(name, (*columns, *(PAPER_ATTENTION if printed else ())), tuple(rows)) if rows else None
 

@@ -1,16 +1,16 @@
 """What a report is on: results folders as experiments left them, and single runs gathered into one."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import get_args
 
-from tcmrl_algo.checkpoint import Run, open_run
+from tcmrl_algo.checkpoint import Run, digest, open_run
 from tcmrl_algo.config import Protocol
 from tcmrl_algo.evaluate import evaluate_run
 from tcmrl_algo.experiment.config import Experiment, read_experiment, run_id
-from tcmrl_algo.experiment.results import RunResult, read_results
-from tcmrl_algo.train import digest
+from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file
 from tcmrl_data import CheckpointError, TrainingError, canonical_json, parse_json
 
 
@@ -29,10 +29,17 @@ class FinishedRun:
 
 @dataclass(frozen=True)
 class Source:
-    """One experiment and its finished runs, by environment, method and seed."""
+    """One experiment and its finished runs, by environment, method and seed.
+
+    Attributes:
+        experiment: the file.
+        runs: finished.
+        missing: the file's other runs, and why they failed where they did.
+    """
 
     experiment: Experiment
     runs: tuple[FinishedRun, ...]
+    missing: tuple[str, ...] = ()
 
     def environments(self) -> list[str]:
         """Those with finished runs."""
@@ -80,12 +87,25 @@ def _results_folder(path: Path) -> Source:
     ]
     if not found:
         raise CheckpointError(f"{path} holds no finished run yet; `tcmrl experiment` goes on with them")
-    return Source(experiment, tuple(found))
+    return Source(experiment, tuple(found), _missing(path, experiment))
+
+
+def _missing(path: Path, experiment: Experiment) -> tuple[str, ...]:
+    found = []
+    for environment, method, seed in itertools.product(
+        experiment.environments, experiment.methods, experiment.seeds
+    ):
+        name = run_id(environment, method, seed)
+        if not result_file(path / "runs" / name).is_file():
+            error = error_file(path / "runs" / name)
+            reason = f" ({error.read_text(encoding='utf-8').strip()})" if error.is_file() else ""
+            found.append(f"`{name}`{reason}")
+    return tuple(found)
 
 
 def _single_runs(runs: Sequence[Run], report: Callable[[str, int, int], None]) -> Source:
     """Runs as if an experiment had made them; those of one algorithm count as seeds of one method."""
-    labels = _labels(runs)
+    labels = labels_of(runs)
     experiment = read_experiment(
         {
             "schema": 1,
@@ -113,21 +133,25 @@ def _single_runs(runs: Sequence[Run], report: Callable[[str, int, int], None]) -
     )
 
 
-def _labels(runs: Sequence[Run]) -> list[str]:
-    """The algorithm where seeds alone tell its runs apart, else the folder's name too."""
-    kinds: dict[str, set[bytes]] = {}
-    places: dict[str, list[tuple[str, int]]] = {}
-    for run in runs:
-        name = run.record.config.settings.run.algorithm
-        kinds.setdefault(name, set()).add(canonical_json(run.record.config.model_dump(mode="json")))
-        places.setdefault(name, []).append((run.record.environment, run.record.seed))
+def labels_of(runs: Sequence[Run]) -> list[str]:
+    """The algorithm where seeds alone tell its runs on an environment apart, else the folder's name too."""
+    groups: dict[tuple[str, str], list[Run]] = {}
     names = [run.record.config.settings.run.algorithm for run in runs]
+    for name, run in zip(names, runs, strict=True):
+        groups.setdefault((name, run.record.environment), []).append(run)
+    mixed = {name for (name, _), group in groups.items() if not _are_seeds(group)}
     return [
-        name
-        if len(kinds[name]) == 1 and len(set(places[name])) == len(places[name])
-        else f"{name} {run.folder.name}"
-        for name, run in zip(names, runs, strict=True)
+        f"{name} {run.folder.name}" if name in mixed else name for name, run in zip(names, runs, strict=True)
     ]
+
+
+def _are_seeds(runs: Sequence[Run]) -> bool:
+    """Whether runs have all in common but their seeds."""
+    kinds = {
+        (canonical_json(run.record.config.model_dump(mode="json")), run.record.root, run.newest().step)
+        for run in runs
+    }
+    return len(kinds) == 1 and len({run.record.seed for run in runs}) == len(runs)
 
 
 def _evaluated(label: str, run: Run) -> RunResult:

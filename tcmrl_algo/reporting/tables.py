@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tcmrl_algo.aggregate import Summary, summarize
+from tcmrl_algo.aggregate import summarize
 from tcmrl_algo.experiment.results import table_text
 
 Cell = str | float | int | None
@@ -39,14 +39,14 @@ def across_seeds(values: Sequence[float | None]) -> tuple[Cell, Cell, Cell]:
     if not known or len(known) < len(values):
         return None, None, None
     summary = summarize(known)
-    return summary.mean, summary.iqm, spread(summary)
+    return summary.mean, summary.iqm, spread(summary.values, summary.low, summary.high)
 
 
-def spread(summary: Summary) -> str:
+def spread(values: Sequence[float], low: float | None, high: float | None) -> str:
     """The 95% interval, or the seeds."""
-    if summary.low is None or summary.high is None:
-        return "seeds: " + ", ".join(f"{each:.4g}" for each in summary.values)
-    return f"{summary.low:.4g} to {summary.high:.4g}"
+    if low is None or high is None:
+        return "seeds: " + ", ".join(f"{each:.4g}" for each in values)
+    return f"{low:.4g} to {high:.4g}"
 
 
 def _text(cell: Cell) -> str:
