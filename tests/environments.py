@@ -1,0 +1,63 @@
+"""Environments as their recipes make them, and episodes played in them, for the tests of environments."""
+
+import functools
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from tcmrl_data import load_recipe
+from tcmrl_data.environment import (
+    Controller,
+    Environment,
+    Parameters,
+)
+from tcmrl_data.rollout import roll_out
+from tcmrl_data.trajectory import Trajectory
+
+ML1_IN_FULL = ("ml1/reach", "ml1/door-close", "ml1/stick-pull")
+STEPS = 25
+
+
+def environment_of(name: str, *overrides: str) -> Environment:
+    return load_recipe(name, overrides=overrides).make_environment()
+
+
+@functools.cache
+def parameters_of(name: str) -> tuple[dict[str, Any], ...]:
+    """Task parameters; cached because ML1 takes a second to draw them."""
+    settings = environment_of(name).settings
+    return tuple(environment_of(name).draw_parameters(settings.tasks, settings.task_seed))
+
+
+def actions_of(environment: Environment, seed: int = 0, steps: int = STEPS) -> np.ndarray:
+    shape = (steps, environment.action_dim)
+    return np.random.default_rng(seed).uniform(-1.0, 1.0, shape).astype(np.float32)
+
+
+def play(env: gymnasium.Env[Any, Any], actions: np.ndarray, *, seed: int) -> list[tuple[Any, ...]]:
+    """Everything an episode returns, in a form that compares exactly."""
+    observation, info = env.reset(seed=seed)
+    episode: list[tuple[Any, ...]] = [(observation.tobytes(), info)]
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        episode.append((observation.tobytes(), reward, terminated, truncated, info))
+        if terminated or truncated:
+            break
+    return episode
+
+
+def episodes(
+    environment: Environment, controller: Controller, tasks: Sequence[Parameters]
+) -> list[Trajectory]:
+    lanes = environment.lanes(tasks)
+    noise = [np.random.default_rng(lane) for lane in range(len(tasks))]
+    return roll_out(environment, lanes, controller, reset_seeds=range(len(tasks)), noise=noise)
+
+
+class Still(Controller):
+    """Never moves."""
+
+    def act(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
+        return np.zeros_like(noise)
