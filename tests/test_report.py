@@ -20,6 +20,7 @@ from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.records import read_record
 from tcmrl_algo.reporting.claims import Verdict, judge, measure_result
 from tcmrl_algo.reporting.contexts import Stored, TrainedContexts, distance_ratio, embed
+from tcmrl_algo.reporting.figures import draw_embeddings
 from tcmrl_algo.reporting.sections import attention_table, final_table, published, published_table
 from tcmrl_algo.reporting.sources import FinishedRun, labels_of, read_sources
 from tcmrl_algo.reporting.tables import Table, across_seeds
@@ -138,6 +139,13 @@ def test_tsne_keeps_far_groups_apart_and_repeats_itself() -> None:
     apart = np.linalg.norm(first.mean(axis=0) - second.mean(axis=0))
     assert apart > 2 * max(first.std(), second.std())
     assert np.array_equal(points, embed(groups.astype(np.float32)))
+
+
+def test_methods_may_have_different_numbers_of_contexts(tmp_path: Path) -> None:
+    points = {"few": np.zeros((2, 2), dtype=np.float32), "many": np.ones((4, 2), dtype=np.float32)}
+    labels = {"few": np.array([0, 1]), "many": np.array([0, 0, 1, 1])}
+    draw_embeddings(tmp_path / "contexts.png", points, labels, [False, True])
+    assert (tmp_path / "contexts.png").read_bytes().startswith(PNG)
 
 
 def test_attention_is_relative_and_makes_the_context(trained: FinishedRun, tiny: Dataset) -> None:
@@ -277,9 +285,10 @@ def test_a_report_names_the_runs_that_are_missing_and_why(copy: Path) -> None:
     lost.with_name(f"{lost.name}.json").unlink()
     lost.mkdir()
     (lost / "error.txt").write_text("loss/critic is not finite at step 7\n")
-    text = write_report([copy], copy / "report").report.read_text()
+    report = write_report([copy], copy / "report")
+    text = report.report.read_text()
     assert f"1 of its runs, `{lost.name}` (loss/critic is not finite at step 7)" in text
-    assert "| 0 |" in text  # seeds of the claim that it was part of
+    assert [each.seeds for each in report.verdicts] == [(), ()]  # no run to compare, no checkpoint to look at
 
 
 def test_what_is_no_run_is_refused(results: Path, tmp_path: Path, call: Call) -> None:
