@@ -5,16 +5,16 @@ from pathlib import Path
 import numpy as np
 
 import tcmrl_data
-from tcmrl_data.driver import Driver, make_groups
-from tcmrl_data.environment import Environment
-from tcmrl_data.manifest import References, part_folder
-from tcmrl_data.part import seal_part
-from tcmrl_data.provenance import provenance
-from tcmrl_data.publish import publish_folder
-from tcmrl_data.recipe import Recipe
-from tcmrl_data.snapshot import ScriptedPolicy, Snapshot
-from tcmrl_data.tasks import Task, choose_tasks
-from tcmrl_data.trajectory import Trajectory
+from tcmrl_data.behavior.snapshot import ScriptedPolicy, Snapshot
+from tcmrl_data.build.driver import Driver, make_groups
+from tcmrl_data.build.part import seal_part
+from tcmrl_data.build.provenance import provenance
+from tcmrl_data.envs.base import Environment
+from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.disk import publish_folder
+from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.recipe.tasks import Task, choose_tasks
+from tcmrl_data.store.manifest import References, part_folder
 
 STEPS = 10_000
 """Environment steps between two snapshots."""

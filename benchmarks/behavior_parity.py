@@ -24,11 +24,11 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data import Recipe, load_recipe
-from tcmrl_data.behavior import BehaviorContext
-from tcmrl_data.checkpoints import CheckpointFolder
-from tcmrl_data.part import roll_out_part
-from tcmrl_data.tasks import Task, choose_tasks
-from tcmrl_data.unit import behavior_source
+from tcmrl_data.behavior.base import BehaviorContext
+from tcmrl_data.behavior.checkpoints import CheckpointFolder
+from tcmrl_data.build.part import roll_out_part
+from tcmrl_data.build.unit import behavior_source
+from tcmrl_data.recipe.tasks import Task, choose_tasks
 
 CHECKPOINTS = 5
 RESAMPLES = 10_000

@@ -21,10 +21,10 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data import Recipe, load_recipe
-from tcmrl_data.behavior import BehaviorContext
-from tcmrl_data.checkpoints import CheckpointFolder
-from tcmrl_data.tasks import choose_tasks
-from tcmrl_data.unit import behavior_source
+from tcmrl_data.behavior.base import BehaviorContext
+from tcmrl_data.behavior.checkpoints import CheckpointFolder
+from tcmrl_data.build.unit import behavior_source
+from tcmrl_data.recipe.tasks import choose_tasks
 
 SETTINGS = [
     ("point-robot-wind", 64, 128),

@@ -17,10 +17,10 @@ import torch
 
 import tcmrl_data
 from tcmrl_data import canonical, publish
-from tcmrl_data.manifest import part_folder
-from tcmrl_data.publish import Disk, make_folders
-from tcmrl_data.tasks import choose_tasks
-from tcmrl_data.unit import UnitSpec, run_unit
+from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.foundation.disk import Disk, make_folders
+from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.store.manifest import part_folder
 
 
 class Stopwatch:

@@ -21,9 +21,9 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from tcmrl_algo import ContextAlgorithm
-from tcmrl_algo.config import ALGORITHMS, TrainingSettings
-from tcmrl_algo.memory import keep_freed_memory
-from tcmrl_algo.problem import Problem
+from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.training.config import ALGORITHMS, TrainingSettings
+from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_data import Batch, Steps, plugin
 
 PEAK_SIZE = 1024

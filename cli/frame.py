@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from tcmrl_data.errors import TcmrlError
-from tcmrl_data.plain_files import printable
+from tcmrl_data.foundation.errors import TcmrlError
+from tcmrl_data.foundation.plain_files import printable
 
 if TYPE_CHECKING:
     from rich.table import Table

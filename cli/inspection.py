@@ -46,7 +46,7 @@ def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recomp
       tcmrl-data inspect returns data/point-robot --recompute --json
     """
     import tcmrl_data
-    from tcmrl_data.returns import first_disagreement, plot_returns, summarize
+    from tcmrl_data.dataset.returns import first_disagreement, plot_returns, summarize
 
     opened = tcmrl_data.open_dataset(dataset)
     table = tcmrl_data.return_table(opened, recompute=recompute)
@@ -95,7 +95,7 @@ def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
       tcmrl-data inspect tasks data/point-robot
     """
     import tcmrl_data
-    from tcmrl_data.returns import task_table
+    from tcmrl_data.dataset.returns import task_table
 
     document = task_table(tcmrl_data.open_dataset(dataset))
     if as_json:
@@ -125,7 +125,7 @@ def snapshots(dataset: Path, as_json: bool, quiet: bool) -> None:
       tcmrl-data inspect snapshots data/point-robot
     """
     import tcmrl_data
-    from tcmrl_data.returns import snapshot_table
+    from tcmrl_data.dataset.returns import snapshot_table
 
     document = snapshot_table(tcmrl_data.open_dataset(dataset))
     if as_json:
@@ -151,7 +151,7 @@ def episodes(dataset: Path, as_json: bool, quiet: bool, task: int | None, step: 
       tcmrl-data inspect episodes data/point-robot --task 7 --step 3000
     """
     import tcmrl_data
-    from tcmrl_data.returns import episode_table
+    from tcmrl_data.dataset.returns import episode_table
 
     document = episode_table(tcmrl_data.open_dataset(dataset), task=task, step=step)
     if as_json:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from tcmrl_data.plain_files import printable
+from tcmrl_data.foundation.plain_files import printable
 
 from .frame import duration, make_table, output_options, print_json, print_table
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcmrl_data.plain_files import printable
+from tcmrl_data.foundation.plain_files import printable
 
 from .frame import duration, fail_incomplete, output_options, print_json, size
 from .progress import StageProgress

@@ -7,30 +7,30 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tcmrl_algo.aggregate import Summary, summarize
-    from tcmrl_algo.checkpoint import Run, RunRecord, open_run
-    from tcmrl_algo.config import TrainingConfig, TrainingSettings, resolve
-    from tcmrl_algo.context_algorithm import ContextAlgorithm
-    from tcmrl_algo.evaluate import Evaluation, TaskResult, evaluate_run
+    from tcmrl_algo.adaptation.evaluate import Evaluation, TaskResult, evaluate_run
+    from tcmrl_algo.context_methods.learner import ContextAlgorithm
+    from tcmrl_algo.experiment.aggregate import Summary, summarize
     from tcmrl_algo.experiment.config import Experiment, experiment_names, load_experiment
     from tcmrl_algo.experiment.driver import ExperimentReport, Finished, run_experiment
     from tcmrl_algo.experiment.results import RunResult
-    from tcmrl_algo.problem import Algorithm, Problem
+    from tcmrl_algo.methods.problem import Algorithm, Problem
     from tcmrl_algo.reporting.write import Report, write_report
-    from tcmrl_algo.train import Progress, TrainingReport, create_algorithm, resume_run, train_run
+    from tcmrl_algo.training.checkpoint import Run, RunRecord, open_run
+    from tcmrl_algo.training.config import TrainingConfig, TrainingSettings, resolve
+    from tcmrl_algo.training.train import Progress, TrainingReport, create_algorithm, resume_run, train_run
 
 _HOMES = {
-    "aggregate": ("Summary", "summarize"),
-    "checkpoint": ("Run", "RunRecord", "open_run"),
-    "config": ("TrainingConfig", "TrainingSettings", "resolve"),
-    "context_algorithm": ("ContextAlgorithm",),
-    "evaluate": ("Evaluation", "TaskResult", "evaluate_run"),
+    "experiment.aggregate": ("Summary", "summarize"),
+    "training.checkpoint": ("Run", "RunRecord", "open_run"),
+    "training.config": ("TrainingConfig", "TrainingSettings", "resolve"),
+    "context_methods.learner": ("ContextAlgorithm",),
+    "adaptation.evaluate": ("Evaluation", "TaskResult", "evaluate_run"),
     "experiment.config": ("Experiment", "experiment_names", "load_experiment"),
     "experiment.driver": ("ExperimentReport", "Finished", "run_experiment"),
     "experiment.results": ("RunResult",),
-    "problem": ("Algorithm", "Problem"),
+    "methods.problem": ("Algorithm", "Problem"),
     "reporting.write": ("Report", "write_report"),
-    "train": ("Progress", "TrainingReport", "create_algorithm", "resume_run", "train_run"),
+    "training.train": ("Progress", "TrainingReport", "create_algorithm", "resume_run", "train_run"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

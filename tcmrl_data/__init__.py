@@ -8,13 +8,17 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from tcmrl_data.build import BuildReport, build_dataset
-    from tcmrl_data.canonical import canonical_json, parse_json
-    from tcmrl_data.dataset import Dataset, open_dataset
-    from tcmrl_data.discovery import plugin
-    from tcmrl_data.engine import Unit
+    from tcmrl_data.behavior.snapshot import import_sac
+    from tcmrl_data.build.build import BuildReport, build_dataset
+    from tcmrl_data.build.events import BuildEvent, BuildStatus, build_status
+    from tcmrl_data.build.plan import Plan, plan_build
+    from tcmrl_data.dataset.dataset import Dataset, open_dataset
+    from tcmrl_data.dataset.listing import list_datasets
+    from tcmrl_data.dataset.returns import return_table
+    from tcmrl_data.dataset.selection import Selection
+    from tcmrl_data.engine.base import Unit
     from tcmrl_data.engine.worker import serve
-    from tcmrl_data.environment import (
+    from tcmrl_data.envs.base import (
         Controller,
         Environment,
         Lanes,
@@ -22,12 +26,13 @@ if TYPE_CHECKING:
         environment_types,
         make_environment,
     )
-    from tcmrl_data.errors import CheckpointError, SelectionError, TcmrlError, TrainingError
-    from tcmrl_data.events import BuildEvent, BuildStatus, build_status
-    from tcmrl_data.listing import list_datasets
-    from tcmrl_data.manifest import Manifest
-    from tcmrl_data.plan import Plan, plan_build
-    from tcmrl_data.recipe import (
+    from tcmrl_data.envs.rollout import roll_out
+    from tcmrl_data.envs.trajectory import Trajectory
+    from tcmrl_data.foundation.canonical import canonical_json, parse_json
+    from tcmrl_data.foundation.errors import CheckpointError, SelectionError, TcmrlError, TrainingError
+    from tcmrl_data.foundation.plugins import plugin
+    from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator, keyed_seed
+    from tcmrl_data.recipe.recipe import (
         PROFILES,
         Recipe,
         apply_overrides,
@@ -35,9 +40,7 @@ if TYPE_CHECKING:
         list_environments,
         load_recipe,
     )
-    from tcmrl_data.returns import return_table
-    from tcmrl_data.rollout import roll_out
-    from tcmrl_data.sampler import Sampler
+    from tcmrl_data.recipe.tasks import Task, draw_tasks, parse_indices
     from tcmrl_data.sampling.batch import Batch, BatchSizes, Moments, Steps
     from tcmrl_data.sampling.cache import (
         CacheEntry,
@@ -48,24 +51,21 @@ if TYPE_CHECKING:
         parse_bytes,
     )
     from tcmrl_data.sampling.prefetch import Prefetch
-    from tcmrl_data.seeding import NO_TASK, Purpose, keyed_generator, keyed_seed
-    from tcmrl_data.selection import Selection
-    from tcmrl_data.snapshot import import_sac
-    from tcmrl_data.tasks import Task, draw_tasks, parse_indices
-    from tcmrl_data.trajectory import Trajectory
+    from tcmrl_data.sampling.sampler import Sampler
+    from tcmrl_data.store.manifest import Manifest
     from tcmrl_data.verification.garbage import Garbage, collect_garbage
     from tcmrl_data.verification.repair import RepairReport, repair_dataset
     from tcmrl_data.verification.replay import Replay
-    from tcmrl_data.verify import Finding, VerifyLevel, VerifyReport, verify_dataset
+    from tcmrl_data.verification.verify import Finding, VerifyLevel, VerifyReport, verify_dataset
 
 _HOMES = {
-    "build": ("BuildReport", "build_dataset"),
-    "canonical": ("canonical_json", "parse_json"),
-    "dataset": ("Dataset", "open_dataset"),
-    "discovery": ("plugin",),
-    "engine": ("Unit",),
+    "build.build": ("BuildReport", "build_dataset"),
+    "foundation.canonical": ("canonical_json", "parse_json"),
+    "dataset.dataset": ("Dataset", "open_dataset"),
+    "foundation.plugins": ("plugin",),
+    "engine.base": ("Unit",),
     "engine.worker": ("serve",),
-    "environment": (
+    "envs.base": (
         "Controller",
         "Environment",
         "Lanes",
@@ -73,15 +73,22 @@ _HOMES = {
         "environment_types",
         "make_environment",
     ),
-    "errors": ("CheckpointError", "SelectionError", "TcmrlError", "TrainingError"),
-    "events": ("BuildEvent", "BuildStatus", "build_status"),
-    "listing": ("list_datasets",),
-    "manifest": ("Manifest",),
-    "plan": ("Plan", "plan_build"),
-    "recipe": ("PROFILES", "Recipe", "apply_overrides", "first_problem", "list_environments", "load_recipe"),
-    "returns": ("return_table",),
-    "rollout": ("roll_out",),
-    "sampler": ("Sampler",),
+    "foundation.errors": ("CheckpointError", "SelectionError", "TcmrlError", "TrainingError"),
+    "build.events": ("BuildEvent", "BuildStatus", "build_status"),
+    "dataset.listing": ("list_datasets",),
+    "store.manifest": ("Manifest",),
+    "build.plan": ("Plan", "plan_build"),
+    "recipe.recipe": (
+        "PROFILES",
+        "Recipe",
+        "apply_overrides",
+        "first_problem",
+        "list_environments",
+        "load_recipe",
+    ),
+    "dataset.returns": ("return_table",),
+    "envs.rollout": ("roll_out",),
+    "sampling.sampler": ("Sampler",),
     "sampling.batch": ("Batch", "BatchSizes", "Moments", "Steps"),
     "sampling.cache": (
         "CacheEntry",
@@ -92,15 +99,15 @@ _HOMES = {
         "parse_bytes",
     ),
     "sampling.prefetch": ("Prefetch",),
-    "seeding": ("NO_TASK", "Purpose", "keyed_generator", "keyed_seed"),
-    "selection": ("Selection",),
-    "snapshot": ("import_sac",),
-    "tasks": ("Task", "draw_tasks", "parse_indices"),
-    "trajectory": ("Trajectory",),
+    "foundation.seeding": ("NO_TASK", "Purpose", "keyed_generator", "keyed_seed"),
+    "dataset.selection": ("Selection",),
+    "behavior.snapshot": ("import_sac",),
+    "recipe.tasks": ("Task", "draw_tasks", "parse_indices"),
+    "envs.trajectory": ("Trajectory",),
     "verification.garbage": ("Garbage", "collect_garbage"),
     "verification.repair": ("RepairReport", "repair_dataset"),
     "verification.replay": ("Replay",),
-    "verify": ("Finding", "VerifyLevel", "VerifyReport", "verify_dataset"),
+    "verification.verify": ("Finding", "VerifyLevel", "VerifyReport", "verify_dataset"),
 }
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 

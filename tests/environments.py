@@ -8,13 +8,13 @@ import gymnasium
 import numpy as np
 
 from tcmrl_data import load_recipe
-from tcmrl_data.environment import (
+from tcmrl_data.envs.base import (
     Controller,
     Environment,
     Parameters,
 )
-from tcmrl_data.rollout import roll_out
-from tcmrl_data.trajectory import Trajectory
+from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.trajectory import Trajectory
 
 ML1_IN_FULL = ("ml1/reach", "ml1/door-close", "ml1/stick-pull")
 STEPS = 25

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 from safetensors.numpy import load, save
 
-from tcmrl_data.canonical import canonical_json, digest, sha256
-from tcmrl_data.manifest import MANIFEST, PartEntry, merkle_root, part_folder, seal
+from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
+from tcmrl_data.store.manifest import MANIFEST, PartEntry, merkle_root, part_folder, seal
 
 TASKS, STEP = (0, 3), 150
 PART = part_folder(0, STEP)
@@ -298,7 +298,7 @@ def _swap(forge: Forge) -> None:
 
 def _nan_array(forge: Forge) -> None:
     """NaN rewards, encoded and sealed as if they had been rolled out."""
-    from tcmrl_data.store import array_digests, encode_arrays, read_arrays
+    from tcmrl_data.store.arrays import array_digests, encode_arrays, read_arrays
 
     rewards = read_arrays(forge.part, ["rewards"])["rewards"].copy()
     rewards[7] = np.nan
@@ -308,7 +308,7 @@ def _nan_array(forge: Forge) -> None:
 
 def _offsets(values: list[int]) -> Callable[[Forge], object]:
     def damage(forge: Forge) -> None:
-        from tcmrl_data.store import array_digests, encode_arrays
+        from tcmrl_data.store.arrays import array_digests, encode_arrays
 
         arrays = {"episode_offsets": np.array(values, dtype=np.int64)}
         forge.write("episode_offsets/c/0", encode_arrays(arrays)["episode_offsets/c/0"])

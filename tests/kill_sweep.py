@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from tcmrl_data.manifest import Manifest, part_folder, read_manifest
-from tcmrl_data.publish import STAGING, lock_file, remove_abandoned
+from tcmrl_data.foundation.disk import STAGING, lock_file, remove_abandoned
+from tcmrl_data.store.manifest import Manifest, part_folder, read_manifest
 
 MARK = "TCMRL_KILL_SWEEP"
 

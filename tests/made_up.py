@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from tcmrl_algo.config import TrainingSettings
-from tcmrl_algo.problem import Problem
+from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.training.config import TrainingSettings
 from tcmrl_data import Batch, Steps, Trajectory
 
 TASKS, EPISODE = 3, 6

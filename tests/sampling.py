@@ -5,9 +5,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from tcmrl_data import BatchSizes, Trajectory
-from tcmrl_data.sampler import Sampler
 from tcmrl_data.sampling.rows import Episodes, Rows, fill_rows
-from tcmrl_data.store import pack
+from tcmrl_data.sampling.sampler import Sampler
+from tcmrl_data.store.arrays import pack
 
 
 def rows_of(tasks: Sequence[Sequence[Trajectory]]) -> Rows:

@@ -13,9 +13,9 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildReport, Dataset, Recipe, TcmrlError, build, publish
-from tcmrl_data.engine import BaseEngine, Message, Result, Unit
-from tcmrl_data.manifest import part_folder
-from tcmrl_data.publish import Disk, publish_folder
+from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
+from tcmrl_data.foundation.disk import Disk, publish_folder
+from tcmrl_data.store.manifest import part_folder
 
 Fault = Literal["kill", "torn", "full", "broken"]
 FAULTS: tuple[Fault, ...] = ("kill", "torn", "full", "broken")

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tcmrl_algo import actor_critic as module
-from tcmrl_algo.actor_critic import ActorCritic, ActorCriticSettings, value_bounds
+from tcmrl_algo.actor_critic import actor_critic as module
+from tcmrl_algo.actor_critic.actor_critic import ActorCritic, ActorCriticSettings, value_bounds
 from tests.made_up import TASKS, problem, steps
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcmrl_algo import Summary, summarize
-from tcmrl_algo.aggregate import mean_interval
+from tcmrl_algo.experiment.aggregate import mean_interval
 from tcmrl_data import TrainingError
 
 

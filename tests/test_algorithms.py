@@ -8,21 +8,21 @@ import numpy as np
 import pytest
 import torch
 
-from tcmrl_algo import losses
-from tcmrl_algo.actor_critic import ActorCritic
+from tcmrl_algo.actor_critic.actor_critic import ActorCritic
 from tcmrl_algo.algorithms import focal, no_context
-from tcmrl_algo.config import ALGORITHMS
-from tcmrl_algo.context_algorithm import (
+from tcmrl_algo.context_methods.learner import (
     ContextAlgorithm,
     ContextController,
     ContextLearner,
     ContextLosses,
     pack,
 )
-from tcmrl_algo.optimizer import Adam
-from tcmrl_algo.problem import Algorithm
+from tcmrl_algo.losses import context as losses
+from tcmrl_algo.methods.problem import Algorithm
+from tcmrl_algo.networks.optimizer import Adam
+from tcmrl_algo.training.config import ALGORITHMS
 from tcmrl_data import Batch, BatchSizes, Controller, Steps, UniformController
-from tcmrl_data.discovery import modules
+from tcmrl_data.foundation.plugins import modules
 from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, trajectory
 
 FOUND = modules(ALGORITHMS)

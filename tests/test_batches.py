@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from tcmrl_algo import resolve
-from tcmrl_algo.batches import Batches, JoinedBatches, open_batches
+from tcmrl_algo.training.batches import Batches, JoinedBatches, open_batches
 from tcmrl_data import BatchSizes, Dataset, Sampler
 
 

@@ -10,9 +10,9 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe, open_dataset
-from tcmrl_data.errors import BuildError, LockedError, ManifestError, StoreError
-from tcmrl_data.manifest import MANIFEST, read_manifest
-from tcmrl_data.publish import LOCK, lock_file
+from tcmrl_data.foundation.disk import LOCK, lock_file
+from tcmrl_data.foundation.errors import BuildError, LockedError, ManifestError, StoreError
+from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tests.conftest import TASKS, TINY
 
 Copy = Callable[[], Path]

@@ -21,7 +21,7 @@ from tcmrl_data import (
     open_dataset,
     parse_bytes,
 )
-from tcmrl_data.errors import CacheError, StoreError
+from tcmrl_data.foundation.errors import CacheError, StoreError
 from tcmrl_data.sampling import cache
 from tcmrl_data.sampling.cache import cached_rows, load_rows
 from tcmrl_data.sampling.cache_entry import _write_rows

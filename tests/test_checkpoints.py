@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 
 from tcmrl_data import Recipe, load_recipe
-from tcmrl_data.behavior import BehaviorContext
-from tcmrl_data.checkpoints import Checkpoint, CheckpointFolder
-from tcmrl_data.publish import CHECKPOINTS
-from tcmrl_data.snapshot import Snapshot
-from tcmrl_data.tasks import choose_tasks
-from tcmrl_data.unit import behavior_source
+from tcmrl_data.behavior.base import BehaviorContext
+from tcmrl_data.behavior.checkpoints import Checkpoint, CheckpointFolder
+from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.build.unit import behavior_source
+from tcmrl_data.foundation.disk import CHECKPOINTS
+from tcmrl_data.recipe.tasks import choose_tasks
 from tests.conftest import TINY
 
 

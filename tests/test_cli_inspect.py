@@ -152,7 +152,7 @@ def test_an_incomplete_dataset_can_be_inspected(call: Call, tiny_copy: Copy) -> 
 
 def forget_parts(folder: Path, *, task: int) -> None:
     """Makes the manifest that a build leaves when it is stopped before a task's first part."""
-    from tcmrl_data.manifest import PartEntry, merkle_root, read_manifest, seal
+    from tcmrl_data.store.manifest import PartEntry, merkle_root, read_manifest, seal
 
     manifest = read_manifest(folder)
     fields = manifest.model_dump(mode="json", exclude={"digest"})

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from tcmrl_data import Dataset, list_datasets, open_dataset
-from tcmrl_data.canonical import digest
-from tcmrl_data.errors import ManifestError, SelectionError, StoreError, TaskError
-from tcmrl_data.manifest import MANIFEST, seal
+from tcmrl_data.foundation.canonical import digest
+from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TaskError
+from tcmrl_data.store.manifest import MANIFEST, seal
 from tests.conftest import TASKS
 
 Copy = Callable[[], Path]

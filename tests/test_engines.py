@@ -16,14 +16,14 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
-from tcmrl_data.canonical import digest
-from tcmrl_data.discovery import modules, plugin
-from tcmrl_data.engine import BaseEngine, Message, Result, Unit, _attempt
-from tcmrl_data.errors import BuildError
-from tcmrl_data.manifest import part_folder, read_manifest
-from tcmrl_data.publish import STAGING
-from tcmrl_data.tasks import choose_tasks
-from tcmrl_data.unit import UnitSpec
+from tcmrl_data.build.unit import UnitSpec
+from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit, _attempt
+from tcmrl_data.foundation.canonical import digest
+from tcmrl_data.foundation.disk import STAGING
+from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.plugins import modules, plugin
+from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.store.manifest import part_folder, read_manifest
 from tests.conftest import TASKS, TINY
 from tests.workers import ROOT, command_line, killer, wait_for, worker_pids
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcmrl_data import load_recipe
-from tcmrl_data.environment import (
+from tcmrl_data.envs.base import (
     make_environment,
 )
 from tests.environments import Still, actions_of, environment_of, episodes, parameters_of

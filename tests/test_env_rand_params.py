@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tcmrl_data.environment import (
+from tcmrl_data.envs.base import (
     UniformController,
 )
-from tcmrl_data.errors import TaskError
+from tcmrl_data.foundation.errors import TaskError
 from tests.environments import actions_of, environment_of, episodes, parameters_of
 
 BODIES = ["hopper-rand-params", "walker-rand-params"]

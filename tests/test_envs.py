@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tcmrl_data.environment import (
+from tcmrl_data.envs.base import (
     UniformController,
     environment_types,
 )
-from tcmrl_data.tasks import draw_tasks
+from tcmrl_data.recipe.tasks import draw_tasks
 from tests.environments import ML1_IN_FULL, actions_of, environment_of, episodes, parameters_of, play
 
 NAMES = [name for name in environment_types() if not name.startswith("ml1/")] + list(ML1_IN_FULL)
@@ -145,7 +145,7 @@ def test_fingerprint_names_model_step_and_versions(name: str) -> None:
 
 def test_listing_environments_imports_nothing_heavy() -> None:
     script = (
-        "import sys; from tcmrl_data.environment import environment_types; names = environment_types();"
+        "import sys; from tcmrl_data.envs.base import environment_types; names = environment_types();"
         "heavy = {'mujoco', 'metaworld', 'torch', 'stable_baselines3'} & set(sys.modules);"
         "print(len(names), sorted(heavy))"
     )

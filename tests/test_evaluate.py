@@ -13,10 +13,10 @@ from tcmrl_cli.train import tcmrl
 from torch import Tensor
 
 from tcmrl_algo import Evaluation, evaluate_run, resolve, train_run
-from tcmrl_algo.config import RunSettings
-from tcmrl_algo.evaluate import contexts_of_others
-from tcmrl_algo.problem import Algorithm, Metrics
-from tcmrl_algo.protocols import PROTOCOLS, Arena
+from tcmrl_algo.adaptation.evaluate import contexts_of_others
+from tcmrl_algo.adaptation.protocols import PROTOCOLS, Arena
+from tcmrl_algo.methods.problem import Algorithm, Metrics
+from tcmrl_algo.training.config import RunSettings
 from tcmrl_data import (
     Batch,
     CheckpointError,
@@ -212,7 +212,7 @@ def test_lanes_beyond_one_batch_keep_their_order(two_tests: Dataset, monkeypatch
         return [each.undiscounted_return for each in place.adapted(tasks, contexts, episode=0)]
 
     whole = returns()
-    monkeypatch.setattr("tcmrl_algo.protocols.MOST_LANES", 2)
+    monkeypatch.setattr("tcmrl_algo.adaptation.protocols.MOST_LANES", 2)
     assert returns() == pytest.approx(whole)
 
 
@@ -247,7 +247,7 @@ def test_without_an_oracle_regret_is_null_and_behavior_norms(
 
 
 def test_success_is_the_share_of_final_episodes_that_succeed() -> None:
-    from tcmrl_algo.evaluate import _success
+    from tcmrl_algo.adaptation.evaluate import _success
 
     flags = np.zeros(2, dtype=bool)
     plain = Trajectory(np.zeros((3, 1)), np.zeros((2, 1)), np.zeros(2), flags, flags)

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tcmrl_data import build_status
-from tcmrl_data.events import EVENTS, BuildEvent, EventLog
-from tcmrl_data.publish import LOCK, lock_file
+from tcmrl_data.build.events import EVENTS, BuildEvent, EventLog
+from tcmrl_data.foundation.disk import LOCK, lock_file
 from tests.conftest import TINY
 
 Copy = Callable[[], Path]

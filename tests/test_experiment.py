@@ -20,7 +20,7 @@ from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.driver import Finished
 from tcmrl_algo.experiment.plan import resolve_method
 from tcmrl_algo.experiment.results import RunResult
-from tcmrl_algo.records import read_record
+from tcmrl_algo.training.records import read_record
 from tcmrl_data import TcmrlError, TrainingError
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process

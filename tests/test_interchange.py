@@ -9,13 +9,14 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tcmrl_data import Dataset, Trajectory
-from tcmrl_data.discovery import modules, plugin
-from tcmrl_data.errors import SelectionError, StoreError
-from tcmrl_data.interchange.hdf5 import EPISODE_ARRAYS, export, read_hdf5
+from tcmrl_data.foundation.errors import SelectionError, StoreError
+from tcmrl_data.foundation.plugins import modules, plugin
+from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS, export, read_hdf5
 from tests.conftest import TASKS
 from tests.strategies import trajectories
 
-FORMATS = [module.NAME for module in modules("tcmrl_data.interchange") if hasattr(module, "NAME")]
+FOLDER = "tcmrl_data.interchange.formats"
+FORMATS = [module.NAME for module in modules(FOLDER) if hasattr(module, "NAME")]
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +50,7 @@ class TestEveryFormat:
         self, name: str, tiny: Dataset, tmp_path: Path
     ) -> None:
         seen: list[tuple[int, int]] = []
-        files = plugin("tcmrl_data.interchange", "format", name).export(
+        files = plugin(FOLDER, "format", name).export(
             tiny, tmp_path / "out", snapshots="last", progress=lambda done, total: seen.append((done, total))
         )
         assert seen == [(done, 5) for done in range(1, 6)]
@@ -59,7 +60,7 @@ class TestEveryFormat:
     def test_refuses_a_folder_in_use(self, name: str, tiny: Dataset, tmp_path: Path) -> None:
         (tmp_path / "mine").write_text("mine")
         with pytest.raises(StoreError, match="not empty"):
-            plugin("tcmrl_data.interchange", "format", name).export(tiny, tmp_path, snapshots="all")
+            plugin(FOLDER, "format", name).export(tiny, tmp_path, snapshots="all")
         assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
     def test_a_failure_leaves_nothing(
@@ -74,14 +75,12 @@ class TestEveryFormat:
 
         monkeypatch.setattr(Dataset, "trajectories", fail_late)
         with pytest.raises(StoreError, match="damaged"):
-            plugin("tcmrl_data.interchange", "format", name).export(tiny, tmp_path / "out", snapshots="all")
+            plugin(FOLDER, "format", name).export(tiny, tmp_path / "out", snapshots="all")
         assert list(tmp_path.iterdir()) == []
 
     def test_refuses_a_rule_that_leaves_nothing(self, name: str, tiny: Dataset, tmp_path: Path) -> None:
         with pytest.raises(SelectionError):
-            plugin("tcmrl_data.interchange", "format", name).export(
-                tiny, tmp_path / "out", snapshots="steps>=1000"
-            )
+            plugin(FOLDER, "format", name).export(tiny, tmp_path / "out", snapshots="steps>=1000")
         assert list(tmp_path.iterdir()) == []
 
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tcmrl_algo import losses
+from tcmrl_algo.losses import context as losses
 
 YES = torch.tensor([[True, True]])
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tcmrl_algo.encoding import ContextEncoder
-from tcmrl_algo.networks import (
+from tcmrl_algo.context_methods.encoding import ContextEncoder
+from tcmrl_algo.networks.perceptron import (
     LARGEST_INPUT,
     Perceptron,
     PerceptronEnsemble,
@@ -20,7 +20,7 @@ from tcmrl_algo.networks import (
     side_by_side,
     uniform_attention,
 )
-from tcmrl_algo.policy import GaussianPolicy
+from tcmrl_algo.networks.policy import GaussianPolicy
 from tests.made_up import problem, steps
 
 

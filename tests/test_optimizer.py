@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tcmrl_algo.optimizer import Adam
+from tcmrl_algo.networks.optimizer import Adam
 
 
 def test_the_learning_rate_falls_linearly_to_its_share() -> None:

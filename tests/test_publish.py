@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 
 from tcmrl_data import Dataset, Recipe, build, open_dataset, publish
-from tcmrl_data.driver import check_part
-from tcmrl_data.errors import LockedError, StorageError, TcmrlError
-from tcmrl_data.layout import GROUP
-from tcmrl_data.manifest import part_folder, read_manifest
-from tcmrl_data.publish import LOCK, STAGING, lock_file, lock_holder, publish_folder, remove_abandoned
+from tcmrl_data.build.driver import check_part
+from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, lock_holder, publish_folder, remove_abandoned
+from tcmrl_data.foundation.errors import LockedError, StorageError, TcmrlError
+from tcmrl_data.store.layout import GROUP
+from tcmrl_data.store.manifest import part_folder, read_manifest
 from tests.simulated_disk import (
     FAULTS,
     Fault,
@@ -212,7 +212,7 @@ def test_a_folder_that_stands_there_is_left_alone(tmp_path: Path) -> None:
 HOLD = """
 import sys, time
 from pathlib import Path
-from tcmrl_data.publish import lock_file
+from tcmrl_data.foundation.disk import lock_file
 with lock_file(Path(sys.argv[1]), "the attempt"):
     print("held", flush=True)
     time.sleep(60)

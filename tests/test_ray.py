@@ -14,10 +14,10 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, Recipe, load_recipe
-from tcmrl_data.engine import ATTEMPTS, Unit
+from tcmrl_data.engine.base import ATTEMPTS, Unit
 from tcmrl_data.engine.ray import Engine
-from tcmrl_data.errors import BuildError
-from tcmrl_data.manifest import part_folder, read_manifest
+from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.store.manifest import part_folder, read_manifest
 from tests.conftest import TASKS, TINY
 from tests.workers import ancestors, command_line, marked_pids, wait_for, worker_pids
 

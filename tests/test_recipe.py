@@ -3,10 +3,10 @@ from itertools import pairwise
 import pytest
 
 from tcmrl_data import apply_overrides, load_recipe
-from tcmrl_data.environment import environment_types
-from tcmrl_data.errors import RecipeError, UnknownNameError
-from tcmrl_data.recipe import PROFILES, recipe_names
-from tcmrl_data.tasks import choose_tasks
+from tcmrl_data.envs.base import environment_types
+from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
+from tcmrl_data.recipe.recipe import PROFILES, recipe_names
+from tcmrl_data.recipe.tasks import choose_tasks
 
 
 def test_every_environment_has_a_recipe() -> None:

@@ -17,13 +17,13 @@ import tcmrl_data
 from tcmrl_algo import Report, open_run, run_experiment, write_report
 from tcmrl_algo.experiment.config import Claim, read_experiment
 from tcmrl_algo.experiment.results import RunResult
-from tcmrl_algo.records import read_record
 from tcmrl_algo.reporting.claims import Verdict, judge, measure_result
 from tcmrl_algo.reporting.contexts import Stored, TrainedContexts, distance_ratio, embed
 from tcmrl_algo.reporting.figures import draw_embeddings
 from tcmrl_algo.reporting.sections import attention_table, final_table, published, published_table
 from tcmrl_algo.reporting.sources import FinishedRun, labels_of, read_sources
 from tcmrl_algo.reporting.tables import Table, across_seeds
+from tcmrl_algo.training.records import read_record
 from tcmrl_data import Dataset
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process

@@ -2,8 +2,14 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import Dataset
-from tcmrl_data.errors import SelectionError, TaskError
-from tcmrl_data.returns import episode_table, first_disagreement, snapshot_table, summarize, task_table
+from tcmrl_data.dataset.returns import (
+    episode_table,
+    first_disagreement,
+    snapshot_table,
+    summarize,
+    task_table,
+)
+from tcmrl_data.foundation.errors import SelectionError, TaskError
 
 
 def snapshot(step: int, mean: float, success: float | None = None) -> dict[str, object]:

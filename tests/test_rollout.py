@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from tcmrl_data import Controller, Lanes, UniformController, load_recipe, roll_out
-from tcmrl_data.environment import Environment, EnvironmentLanes, LaneStep
-from tcmrl_data.trajectory import BoolArray, FloatArray
+from tcmrl_data.envs.base import Environment, EnvironmentLanes, LaneStep
+from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 
 
 def roll(environment: Environment, lanes: Lanes, controller: Controller, seed: int = 0) -> list:

@@ -7,9 +7,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tcmrl_data import Batch, BatchSizes, Dataset, Steps, Trajectory
-from tcmrl_data.errors import SelectionError
-from tcmrl_data.sampler import Sampler
+from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.sampling.draws import BLOCK, distinct
+from tcmrl_data.sampling.sampler import Sampler
 from tests.sampling import numbered_tasks, sampler_of
 from tests.strategies import trajectories
 

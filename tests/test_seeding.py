@@ -1,7 +1,13 @@
 import numpy as np
 import pytest
 
-from tcmrl_data.seeding import Purpose, environment_key, keyed_generator, keyed_seed, keyed_sequence
+from tcmrl_data.foundation.seeding import (
+    Purpose,
+    environment_key,
+    keyed_generator,
+    keyed_seed,
+    keyed_sequence,
+)
 
 
 def test_environment_key_is_the_head_of_sha256() -> None:

@@ -9,8 +9,8 @@ from safetensors.numpy import load, save
 from stable_baselines3 import SAC
 
 from tcmrl_data import Dataset, load_recipe
-from tcmrl_data.errors import SnapshotError
-from tcmrl_data.snapshot import LOG_STD_RANGE, Snapshot, read_snapshot, snapshot_of_sac
+from tcmrl_data.behavior.snapshot import LOG_STD_RANGE, Snapshot, read_snapshot, snapshot_of_sac
+from tcmrl_data.foundation.errors import SnapshotError
 
 
 @pytest.fixture(scope="module")
@@ -96,7 +96,7 @@ def test_hostile_snapshots_are_refused(snapshot: Snapshot, tmp_path: Path) -> No
 
 def test_stored_snapshots_reproduce_the_stored_actions(tiny: Dataset) -> None:
     """The last action of an episode follows from the stored observation, policy and keyed noise."""
-    from tcmrl_data.seeding import Purpose, keyed_generator
+    from tcmrl_data.foundation.seeding import Purpose, keyed_generator
 
     lanes = tiny.manifest.recipe.rollouts.lanes
     episodes = tiny.trajectories(3, 100)[:lanes]

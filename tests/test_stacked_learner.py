@@ -12,14 +12,14 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import Tensor
 
 from tcmrl_data import load_recipe
-from tcmrl_data.behavior._stacked_learner import (
+from tcmrl_data.behavior.stacked.learner import (
     Hyperparameters,
     StackedSac,
     Transitions,
     head_gradient,
     sample_policy,
 )
-from tcmrl_data.behavior._stacked_networks import StackedNetwork
+from tcmrl_data.behavior.stacked.networks import StackedNetwork
 
 CPU = torch.device("cpu")
 OBSERVATION_DIM, ACTION_DIM, BATCH = 5, 3, 32

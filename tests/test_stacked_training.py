@@ -12,17 +12,17 @@ from stable_baselines3 import SAC
 
 import tcmrl_data
 from tcmrl_data import Recipe, load_recipe, open_dataset
-from tcmrl_data.behavior import BehaviorContext
-from tcmrl_data.behavior._stacked_training import GroupTraining
-from tcmrl_data.behavior.stacked_sac import Settings, Source, _make_training
-from tcmrl_data.canonical import canonical_json
-from tcmrl_data.checkpoints import CheckpointFolder
-from tcmrl_data.errors import BuildError
-from tcmrl_data.manifest import part_folder, read_manifest
-from tcmrl_data.publish import CHECKPOINTS, make_folders
-from tcmrl_data.snapshot import Snapshot
-from tcmrl_data.tasks import choose_tasks, group_tasks
-from tcmrl_data.unit import UnitSpec, unit_memory
+from tcmrl_data.behavior.base import BehaviorContext
+from tcmrl_data.behavior.checkpoints import CheckpointFolder
+from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.behavior.stacked import Settings, Source, _make_training
+from tcmrl_data.behavior.stacked.training import GroupTraining
+from tcmrl_data.build.unit import UnitSpec, unit_memory
+from tcmrl_data.foundation.canonical import canonical_json
+from tcmrl_data.foundation.disk import CHECKPOINTS, make_folders
+from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
+from tcmrl_data.store.manifest import part_folder, read_manifest
 
 TINY = (
     "behavior.stacked.group=4",
@@ -306,7 +306,7 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
     program = (
         "import json, resource, sys\n"
         "from tcmrl_data import checkpoints\n"
-        "from tcmrl_data.unit import UnitSpec, run_unit\n"
+        "from tcmrl_data.build.unit import UnitSpec, run_unit\n"
         "checkpoints.CheckpointFolder.is_due = lambda self: True\n"
         "run_unit(UnitSpec.from_json(json.load(sys.stdin)), lambda message: None)\n"
         "print(1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)\n"

@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from tcmrl_algo.algorithms import tcmrl
-from tcmrl_algo.context_algorithm import ContextAlgorithm, ContextLosses
-from tcmrl_algo.losses import task_contrastive_loss
+from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLosses
+from tcmrl_algo.losses.context import task_contrastive_loss
 from tcmrl_data import Batch, Steps
 from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps
 

@@ -15,12 +15,12 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_algo
 from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
-from tcmrl_algo.actor_critic import ActorCriticSettings, BracSettings
+from tcmrl_algo.actor_critic.actor_critic import ActorCriticSettings, BracSettings
 from tcmrl_algo.algorithms import tcmrl as tcmrl_module
-from tcmrl_algo.config import ALGORITHMS, OptimizerSettings, RunSettings, TrainingSettings
-from tcmrl_algo.train import Progress
+from tcmrl_algo.training.config import ALGORITHMS, OptimizerSettings, RunSettings, TrainingSettings
+from tcmrl_algo.training.train import Progress
 from tcmrl_data import BatchSizes, CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
-from tcmrl_data.discovery import modules
+from tcmrl_data.foundation.plugins import modules
 from tests.commands import Call, assert_refused, in_process
 
 SMALL = (
@@ -314,7 +314,7 @@ def test_results_do_not_depend_on_prefetching(
     start: Train, depth: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     expected = start("two", steps=15).digest
-    monkeypatch.setattr("tcmrl_algo.train.PREFETCHED", depth)
+    monkeypatch.setattr("tcmrl_algo.training.train.PREFETCHED", depth)
     assert start("other", steps=15).digest == expected
 
 

@@ -18,12 +18,12 @@ from tcmrl_cli.frame import run
 
 import tcmrl_data
 from tcmrl_data import open_dataset, repair_dataset, verify_dataset
-from tcmrl_data.errors import LockedError, ManifestError, NondeterminismError, SnapshotError
-from tcmrl_data.events import EVENTS
-from tcmrl_data.manifest import MANIFEST, part_folder, read_manifest
-from tcmrl_data.publish import CHECKPOINTS, LOCK, STAGING, lock_file
-from tcmrl_data.snapshot import read_snapshot
-from tcmrl_data.store import array_digests, encode_arrays
+from tcmrl_data.behavior.snapshot import read_snapshot
+from tcmrl_data.build.events import EVENTS
+from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_file
+from tcmrl_data.foundation.errors import LockedError, ManifestError, NondeterminismError, SnapshotError
+from tcmrl_data.store.arrays import array_digests, encode_arrays
+from tcmrl_data.store.manifest import MANIFEST, part_folder, read_manifest
 from tcmrl_data.verification import repair as repair_module
 from tcmrl_data.verification import replay as replay_module
 from tcmrl_data.verification.garbage import collect_garbage
@@ -350,7 +350,7 @@ def test_gc_spares_a_live_attempt_and_is_refused_during_a_build(tiny_copy: Copy)
     folder = tiny_copy()
     littered(folder)
     attempt = folder / STAGING / "task_00003.dead"
-    holder = "import sys, time; from tcmrl_data.publish import lock_file; from pathlib import Path\n"
+    holder = "import sys, time; from tcmrl_data.foundation.disk import lock_file; from pathlib import Path\n"
     holder += "with lock_file(Path(sys.argv[1]), 'x'):\n    print('held', flush=True)\n    sys.stdin.read()"
     for lock, is_refused in ((attempt.with_name("task_00003.dead.lock"), False), (folder / LOCK, True)):
         command = [sys.executable, "-c", holder, str(lock)]

@@ -7,12 +7,12 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-from tcmrl_algo import losses
-from tcmrl_algo.config import TrainingSettings
-from tcmrl_algo.context_algorithm import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.encoding import ContextEncoder
-from tcmrl_algo.networks import mean_representation
-from tcmrl_algo.problem import Algorithm, Problem
+from tcmrl_algo.context_methods.encoding import ContextEncoder
+from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.losses import context as losses
+from tcmrl_algo.methods.problem import Algorithm, Problem
+from tcmrl_algo.networks.perceptron import mean_representation
+from tcmrl_algo.training.config import TrainingSettings
 from tcmrl_data import Batch, BatchSizes, Steps
 
 NAME = "focal"

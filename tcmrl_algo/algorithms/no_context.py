@@ -13,9 +13,9 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
-from tcmrl_algo.config import TrainingSettings
-from tcmrl_algo.context_algorithm import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.problem import Algorithm, Problem
+from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.methods.problem import Algorithm, Problem
+from tcmrl_algo.training.config import TrainingSettings
 from tcmrl_data import Batch, BatchSizes, Steps
 
 NAME = "no_context"

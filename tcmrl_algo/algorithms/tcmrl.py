@@ -7,11 +7,11 @@ from jaxtyping import Bool, Float
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-from tcmrl_algo import losses
-from tcmrl_algo.config import TrainingSettings
-from tcmrl_algo.context_algorithm import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.encoding import ContextEncoder, Transitions
-from tcmrl_algo.networks import (
+from tcmrl_algo.context_methods.encoding import ContextEncoder, Transitions
+from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.losses import context as losses
+from tcmrl_algo.methods.problem import Algorithm, Metrics, Problem
+from tcmrl_algo.networks.perceptron import (
     Attention,
     RewardEstimator,
     TaskExtractor,
@@ -19,7 +19,7 @@ from tcmrl_algo.networks import (
     side_by_side,
     uniform_attention,
 )
-from tcmrl_algo.problem import Algorithm, Metrics, Problem
+from tcmrl_algo.training.config import TrainingSettings
 from tcmrl_data import Batch, BatchSizes, Steps
 
 NAME = "tcmrl"

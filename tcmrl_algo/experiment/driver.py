@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_algo.config import TrainingConfig
 from tcmrl_algo.experiment.config import Experiment, run_id
 from tcmrl_algo.experiment.job import Job
 from tcmrl_algo.experiment.plan import PlannedRun, check_same, plan_runs
 from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file, table_text
-from tcmrl_algo.records import read_record, write_file, write_record
-from tcmrl_algo.train import usable_device
+from tcmrl_algo.training.config import TrainingConfig
+from tcmrl_algo.training.records import read_record, write_file, write_record
+from tcmrl_algo.training.train import usable_device
 from tcmrl_data import CheckpointError, TrainingError, Unit, plugin
 
 WORKER = "tcmrl_algo.experiment.job"

@@ -13,12 +13,12 @@ from typing import Any
 import torch
 from pydantic import BaseModel, ConfigDict
 
-from tcmrl_algo.checkpoint import digest, open_run
-from tcmrl_algo.config import Protocol, TrainingConfig
-from tcmrl_algo.evaluate import Evaluation, evaluate_run
+from tcmrl_algo.adaptation.evaluate import Evaluation, evaluate_run
 from tcmrl_algo.experiment.results import CurvePoint, RunResult, result_file
-from tcmrl_algo.records import read_record, write_record
-from tcmrl_algo.train import Progress, resume_run, train_run
+from tcmrl_algo.training.checkpoint import digest, open_run
+from tcmrl_algo.training.config import Protocol, TrainingConfig
+from tcmrl_algo.training.records import read_record, write_record
+from tcmrl_algo.training.train import Progress, resume_run, train_run
 from tcmrl_data import CheckpointError, Dataset, open_dataset, serve
 
 Report = Callable[[Mapping[str, Any]], None]

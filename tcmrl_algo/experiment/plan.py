@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_algo.config import TrainingConfig, resolve
 from tcmrl_algo.experiment.config import EnvironmentChoice, Experiment, override_texts, run_id
+from tcmrl_algo.training.config import TrainingConfig, resolve
 from tcmrl_data import CheckpointError, Dataset, SelectionError, TrainingError, open_dataset
 
 

@@ -8,9 +8,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from tcmrl_algo.config import TrainingConfig
 from tcmrl_algo.experiment.config import Experiment
-from tcmrl_algo.records import read_record
+from tcmrl_algo.training.config import TrainingConfig
+from tcmrl_algo.training.records import read_record
 
 COLUMNS = (
     "environment",

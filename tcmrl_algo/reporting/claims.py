@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
-from tcmrl_algo.aggregate import mean_interval
+from tcmrl_algo.experiment.aggregate import mean_interval
 from tcmrl_algo.experiment.config import Claim, Metric
 from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.reporting.sources import FinishedRun

@@ -9,10 +9,10 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_algo.checkpoint import open_run
-from tcmrl_algo.context_algorithm import ContextAlgorithm
+from tcmrl_algo.context_methods.learner import ContextAlgorithm
 from tcmrl_algo.reporting.sources import FinishedRun
-from tcmrl_algo.train import create_algorithm
+from tcmrl_algo.training.checkpoint import open_run
+from tcmrl_algo.training.train import create_algorithm
 from tcmrl_data import Dataset, Task, Trajectory, open_dataset
 
 NUM_TASKS = 20

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tcmrl_algo.aggregate import summarize
+from tcmrl_algo.experiment.aggregate import summarize
 from tcmrl_algo.experiment.results import RunResult, by_method
 from tcmrl_algo.reporting.contexts import FloatArray, IntArray, TransitionWeights
 

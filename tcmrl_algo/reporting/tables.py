@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from tcmrl_algo.aggregate import summarize
+from tcmrl_algo.experiment.aggregate import summarize
 from tcmrl_algo.experiment.results import table_text
 
 Cell = str | float | int | None

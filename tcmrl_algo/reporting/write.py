@@ -9,12 +9,12 @@ from typing import final
 import numpy as np
 
 from tcmrl_algo.experiment.config import Metric, folder_name
-from tcmrl_algo.records import write_file
 from tcmrl_algo.reporting import figures, sections
 from tcmrl_algo.reporting.claims import Verdict, judge, measure_result
 from tcmrl_algo.reporting.contexts import Trained, TrainedContexts, TransitionWeights, embed
 from tcmrl_algo.reporting.sources import FinishedRun, Source, read_sources
 from tcmrl_algo.reporting.tables import Table
+from tcmrl_algo.training.records import write_file
 from tcmrl_data import TcmrlError
 
 Progress = Callable[[str, int, int], None]

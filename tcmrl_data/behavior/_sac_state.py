@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.checkpoints import Checkpoint
+from tcmrl_data.behavior.checkpoints import Checkpoint
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC

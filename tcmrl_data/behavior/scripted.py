@@ -5,10 +5,10 @@ from typing import final
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data.behavior import BehaviorContext, BehaviorSource
-from tcmrl_data.environment import Environment
-from tcmrl_data.snapshot import ScriptedPolicy, Snapshot
-from tcmrl_data.tasks import Task
+from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
+from tcmrl_data.behavior.snapshot import ScriptedPolicy, Snapshot
+from tcmrl_data.envs.base import Environment
+from tcmrl_data.recipe.tasks import Task
 
 NAME = "scripted"
 

@@ -8,8 +8,8 @@ from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, final
 
-from tcmrl_data.engine import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
 from tcmrl_data.engine._attempt import Outcome, run_attempt
+from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
 
 NAME = "local"
 

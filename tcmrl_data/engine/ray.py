@@ -13,9 +13,9 @@ from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from typing import Any, final
 
-from tcmrl_data.engine import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
 from tcmrl_data.engine._attempt import GRACE_SECONDS, Outcome, run_attempt
-from tcmrl_data.errors import BuildError
+from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
+from tcmrl_data.foundation.errors import BuildError
 
 NAME = "ray"
 LOST_RETRIES = 3

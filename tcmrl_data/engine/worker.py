@@ -15,8 +15,8 @@ from collections.abc import Callable, Mapping
 from types import FrameType
 from typing import Any
 
-from tcmrl_data.errors import TcmrlError
-from tcmrl_data.unit import UnitSpec, run_unit
+from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.foundation.errors import TcmrlError
 
 REPORT_SECONDS = 0.5
 

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from tcmrl_data.trajectory import FloatArray
+from tcmrl_data.envs.trajectory import FloatArray
 
 
 class SimulatedTask(gymnasium.Env[FloatArray, FloatArray]):

@@ -10,9 +10,9 @@ from typing import Any, final
 import numpy as np
 from pydantic import Field, model_validator
 
-from tcmrl_data.environment import Environment, EnvironmentSettings, Parameters, Reward, View
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint, squared_norm
-from tcmrl_data.trajectory import FloatArray
+from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.trajectory import FloatArray
 
 
 class HalfCheetahVelSettings(EnvironmentSettings):

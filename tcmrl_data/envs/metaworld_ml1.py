@@ -16,10 +16,10 @@ import gymnasium
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.environment import Controller, Environment, EnvironmentSettings, Parameters, Reward, View
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint
-from tcmrl_data.errors import TaskError
-from tcmrl_data.trajectory import FloatArray
+from tcmrl_data.envs.base import Controller, Environment, EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.foundation.errors import TaskError
 
 GOAL = slice(-3, None)
 TASKS_PER_SET = 50

@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.environment import (
+from tcmrl_data.envs.base import (
     Controller,
     Environment,
     EnvironmentSettings,
@@ -21,7 +21,7 @@ from tcmrl_data.environment import (
     Reward,
     View,
 )
-from tcmrl_data.trajectory import BoolArray, FloatArray
+from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 
 STEP_SIZE = 0.1
 

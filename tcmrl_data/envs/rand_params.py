@@ -18,10 +18,10 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.environment import Environment, EnvironmentSettings, Parameters, Reward, View
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint, squared_norm
-from tcmrl_data.errors import TaskError
-from tcmrl_data.trajectory import FloatArray
+from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.foundation.errors import TaskError
 
 ALIVE_BONUS = 1.0
 CONTROL_COST = 1e-3

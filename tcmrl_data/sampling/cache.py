@@ -15,9 +15,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcmrl_data.canonical import digest
-from tcmrl_data.errors import CacheError, LockedError
-from tcmrl_data.publish import LOCK, STAGING, lock_file, make_folders, remove_abandoned, remove_tree
+from tcmrl_data.foundation.canonical import digest
+from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, make_folders, remove_abandoned, remove_tree
+from tcmrl_data.foundation.errors import CacheError, LockedError
 from tcmrl_data.sampling.cache_entry import (
     FORMAT,
     RECORD,
@@ -31,7 +31,7 @@ from tcmrl_data.sampling.cache_entry import (
 from tcmrl_data.sampling.rows import Rows, plan_rows, read_rows, table_shape
 
 if TYPE_CHECKING:
-    from tcmrl_data.selection import Selection
+    from tcmrl_data.dataset.selection import Selection
 
 CACHE_BYTES = 100 * 10**9
 """What all entries may take, unless TCMRL_CACHE_LIMIT says otherwise (such as 20G)."""

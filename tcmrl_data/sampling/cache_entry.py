@@ -17,8 +17,8 @@ from typing import IO, TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from tcmrl_data.canonical import canonical_json, sha256
-from tcmrl_data.publish import (
+from tcmrl_data.foundation.canonical import canonical_json, sha256
+from tcmrl_data.foundation.disk import (
     STAGING,
     disk,
     lock_file,
@@ -42,7 +42,7 @@ from tcmrl_data.sampling.rows import (
 )
 
 if TYPE_CHECKING:
-    from tcmrl_data.selection import Selection
+    from tcmrl_data.dataset.selection import Selection
 
 FORMAT = 1
 """Raised when the layout of an entry changes; entries of another format are never opened."""

@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.errors import StoreError
-from tcmrl_data.store import Arrays, checked_offsets, read_arrays
+from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.store.arrays import Arrays, checked_offsets, read_arrays
 
 if TYPE_CHECKING:
-    from tcmrl_data.selection import Selection
+    from tcmrl_data.dataset.selection import Selection
 
 Indices = npt.NDArray[np.int64]
 Table = npt.NDArray[np.float32]

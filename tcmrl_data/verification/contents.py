@@ -11,14 +11,14 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from tcmrl_data.environment import Environment
-from tcmrl_data.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
-from tcmrl_data.manifest import MAX_TASKS, STANDARD_ARRAYS, Manifest, PartRecord
-from tcmrl_data.recipe import first_problem
-from tcmrl_data.snapshot import GaussianPolicy, read_snapshot
-from tcmrl_data.statistics import statistics
-from tcmrl_data.store import array_digests, read_arrays, unpack
-from tcmrl_data.tasks import draw_tasks
+from tcmrl_data.behavior.snapshot import GaussianPolicy, read_snapshot
+from tcmrl_data.envs.base import Environment
+from tcmrl_data.foundation.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
+from tcmrl_data.recipe.recipe import first_problem
+from tcmrl_data.recipe.tasks import draw_tasks
+from tcmrl_data.store.arrays import array_digests, read_arrays, unpack
+from tcmrl_data.store.manifest import MAX_TASKS, STANDARD_ARRAYS, Manifest, PartRecord
+from tcmrl_data.store.statistics import statistics
 
 Problem = tuple[str, str]
 """File or array within the part, and what is wrong with it."""

@@ -4,9 +4,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.errors import BuildError, LockedError
-from tcmrl_data.manifest import MANIFEST, read_manifest
-from tcmrl_data.publish import (
+from tcmrl_data.foundation.disk import (
     CHECKPOINTS,
     LOCK,
     STAGING,
@@ -15,6 +13,8 @@ from tcmrl_data.publish import (
     remove_abandoned,
     remove_tree,
 )
+from tcmrl_data.foundation.errors import BuildError, LockedError
+from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tcmrl_data.verification.repair import REPAIR
 from tcmrl_data.verification.scan import check_work_files
 

@@ -7,13 +7,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build import BuildReport, build_dataset
-from tcmrl_data.errors import NondeterminismError
-from tcmrl_data.events import BuildEvent
-from tcmrl_data.layout import GROUP
-from tcmrl_data.manifest import MANIFEST, Manifest, part_folder, read_manifest, read_sealed_part, seal
-from tcmrl_data.plain_files import folder_problem
-from tcmrl_data.publish import (
+from tcmrl_data.build.build import BuildReport, build_dataset
+from tcmrl_data.build.events import BuildEvent
+from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
     lock_file,
@@ -23,8 +19,12 @@ from tcmrl_data.publish import (
     remove_tree,
     replace_file,
 )
+from tcmrl_data.foundation.errors import NondeterminismError
+from tcmrl_data.foundation.plain_files import folder_problem
+from tcmrl_data.store.layout import GROUP
+from tcmrl_data.store.manifest import MANIFEST, Manifest, part_folder, read_manifest, read_sealed_part, seal
 from tcmrl_data.verification.scan import check_work_files
-from tcmrl_data.verify import Finding, Key, VerifyLevel, verify_dataset
+from tcmrl_data.verification.verify import Finding, Key, VerifyLevel, verify_dataset
 
 REPAIR = "repair"
 """Folder in `.staging` where parts are made again; after a killed repair the next one starts it anew."""

@@ -10,15 +10,15 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from tcmrl_data.environment import Environment
-from tcmrl_data.errors import TcmrlError
-from tcmrl_data.layout import DECODED_FLOOR, DECODED_RATIO
-from tcmrl_data.manifest import Manifest, PartRecord
-from tcmrl_data.part import roll_out_part
-from tcmrl_data.provenance import provenance
-from tcmrl_data.snapshot import read_snapshot
-from tcmrl_data.store import pack, read_arrays
-from tcmrl_data.tasks import Task
+from tcmrl_data.behavior.snapshot import read_snapshot
+from tcmrl_data.build.part import roll_out_part
+from tcmrl_data.build.provenance import provenance
+from tcmrl_data.envs.base import Environment
+from tcmrl_data.foundation.errors import TcmrlError
+from tcmrl_data.recipe.tasks import Task
+from tcmrl_data.store.arrays import pack, read_arrays
+from tcmrl_data.store.layout import DECODED_FLOOR, DECODED_RATIO
+from tcmrl_data.store.manifest import Manifest, PartRecord
 
 FIRST_STEPS = 5
 STEP_TOLERANCE = 1e-3

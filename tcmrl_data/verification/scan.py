@@ -6,10 +6,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.errors import BuildError
-from tcmrl_data.events import EVENTS
-from tcmrl_data.plain_files import file_problem, one_line
-from tcmrl_data.publish import CHECKPOINTS, LOCK, STAGING
+from tcmrl_data.build.events import EVENTS
+from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
+from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.plain_files import file_problem, one_line
 
 WORK_FOLDERS = {STAGING, CHECKPOINTS}
 WORK_FILES = {LOCK, EVENTS}

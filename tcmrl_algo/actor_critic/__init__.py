@@ -1,0 +1,1 @@
+"""The offline actor-critic that context-based methods share."""

@@ -1,0 +1,1 @@
+"""Meta-testing: adaptation to test tasks by a protocol."""

@@ -1,0 +1,1 @@
+"""Methods that adapt through a context."""

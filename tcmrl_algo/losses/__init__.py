@@ -1,0 +1,1 @@
+"""Equations, one pure function each: torch alone."""

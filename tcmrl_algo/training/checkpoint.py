@@ -1,0 +1,191 @@
+"""Runs on disk: `run.json`, and checkpoints of safetensors and JSON that appear whole or not at all."""
+
+import hashlib
+import shutil
+import uuid
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, final
+
+import safetensors.torch
+from pydantic import BaseModel, ConfigDict, Field
+from safetensors import SafetensorError
+from torch import Tensor
+
+from tcmrl_algo.methods.problem import MomentsRecord
+from tcmrl_algo.training.config import TrainingConfig
+from tcmrl_algo.training.records import read_record, sync_folder, write_file, write_record
+from tcmrl_data import CheckpointError, Dataset
+
+KEPT = 2
+"""Newest checkpoints kept: the last one, and one to fall back on."""
+
+
+class RunRecord(BaseModel):
+    """`run.json`: everything a run is a function of, beside the code.
+
+    Attributes:
+        schema_version: of this file.
+        environment: the environment's name.
+        dataset: where the dataset lay.
+        root: the dataset's root, which its content determines.
+        profile: whose training table was resolved.
+        seed: of everything random.
+        steps: how far to train.
+        device: where.
+        config: the resolved configuration.
+        moments: statistics of the data trained on.
+        versions: packages that results depend on.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schema_version: Literal[1] = 1
+    environment: str
+    dataset: str
+    root: str
+    profile: str
+    seed: int = Field(ge=0)
+    steps: int = Field(ge=1)
+    device: str
+    config: TrainingConfig
+    moments: MomentsRecord
+    versions: dict[str, str]
+
+
+class CheckpointRecord(BaseModel):
+    """`checkpoint.json`: the step, and the digest of the tensors beside it.
+
+    No generator state is kept: randomness of every step is a function of the run's seed and the step.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    schema_version: Literal[1] = 1
+    step: int = Field(ge=0)
+    sha256: str
+
+
+@final
+@dataclass(frozen=True)
+class Checkpoint:
+    """A published checkpoint.
+
+    Attributes:
+        folder: where it lies.
+        step: training steps done.
+    """
+
+    folder: Path
+    step: int
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The tensors, on the CPU.
+
+        Raises:
+            CheckpointError: a file is missing or is not what `checkpoint.json` says.
+        """
+        record = read_record(CheckpointRecord, self.folder / "checkpoint.json")
+        file = self.folder / "tensors.safetensors"
+        try:
+            content = file.read_bytes()
+            if hashlib.sha256(content).hexdigest() != record.sha256:
+                raise CheckpointError(f"{file} is damaged; delete {self.folder} to fall back on an older one")
+            return safetensors.torch.load(content)
+        except (OSError, SafetensorError) as error:
+            raise CheckpointError(f"{file} cannot be read: {error}") from None
+
+
+@final
+@dataclass(frozen=True)
+class Run:
+    """A run's folder.
+
+    Attributes:
+        folder: where it lies.
+        record: its `run.json`.
+    """
+
+    folder: Path
+    record: RunRecord
+
+    def checkpoints(self) -> list[Checkpoint]:
+        """Published checkpoints, ascending by step."""
+        folders = sorted(self.folder.glob("checkpoints/step_" + 9 * "[0-9]"))
+        return [Checkpoint(each, int(each.name.removeprefix("step_"))) for each in folders]
+
+    def newest(self) -> Checkpoint:
+        """The checkpoint of the highest step.
+
+        Raises:
+            CheckpointError: there is none.
+        """
+        found = self.checkpoints()
+        if not found:
+            raise CheckpointError(f"{self.folder} has no checkpoint; train it with `tcmrl train --resume`")
+        return found[-1]
+
+    def save(self, step: int, tensors: Mapping[str, Tensor]) -> None:
+        """Publishes a checkpoint by one rename, then removes what is old or was never finished."""
+        folder = self.folder / "checkpoints"
+        staging = folder / f".staging-{uuid.uuid4().hex}"
+        staging.mkdir(parents=True)
+        content = safetensors.torch.save({name: each.cpu().contiguous() for name, each in tensors.items()})
+        record = CheckpointRecord(step=step, sha256=hashlib.sha256(content).hexdigest())
+        write_file(staging / "tensors.safetensors", content)
+        write_record(staging / "checkpoint.json", record)
+        target = folder / f"step_{step:09d}"
+        if target.exists():
+            shutil.rmtree(target)
+        staging.rename(target)
+        sync_folder(folder)
+        left_over = list(folder.glob(".staging-*"))  # of a run killed while it saved
+        for old in (*left_over, *(each.folder for each in self.checkpoints()[:-KEPT])):
+            shutil.rmtree(old)
+
+    def check_dataset(self, dataset: Dataset) -> None:
+        """Refuses data that the run was not trained on.
+
+        Raises:
+            CheckpointError: another environment or another root.
+        """
+        if dataset.name != self.record.environment:
+            raise CheckpointError(
+                f"{dataset.folder} holds {dataset.name!r}, the run in {self.folder} is of "
+                f"{self.record.environment!r}; name the right one with --dataset"
+            )
+        if dataset.manifest.root != self.record.root:
+            raise CheckpointError(
+                f"{dataset.folder} has root {dataset.manifest.root[:12]}, the run in {self.folder} was "
+                f"trained on {self.record.root[:12]}; name that dataset with --dataset, or train anew"
+            )
+
+
+def open_run(folder: str | Path) -> Run:
+    """A run that training made.
+
+    Raises:
+        CheckpointError: the folder is missing or its `run.json` is not what a run writes.
+    """
+    folder = Path(folder)
+    if not (folder / "run.json").is_file():
+        raise CheckpointError(f"{folder} is no run: it has no run.json; `tcmrl train` makes one")
+    return Run(folder, read_record(RunRecord, folder / "run.json"))
+
+
+def write_run(folder: Path, record: RunRecord) -> Run:
+    """Writes `run.json`, replacing an older one at once."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_record(folder / "run.json", record)
+    return Run(folder, record)
+
+
+def digest(tensors: Mapping[str, Tensor]) -> str:
+    """sha256 over names, types and bytes of tensors, sorted by name."""
+    total = hashlib.sha256()
+    for name in sorted(tensors):
+        tensor = tensors[name].cpu().contiguous()
+        total.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
+        total.update(tensor.numpy().tobytes())
+    return total.hexdigest()

@@ -1,0 +1,279 @@
+"""Meta-training: a dataset and a resolved configuration in, a run's folder out."""
+
+import importlib.metadata
+import math
+import sys
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from tcmrl_algo.methods.problem import Algorithm, MomentsRecord, problem_of
+from tcmrl_algo.training.batches import Batches, open_batches
+from tcmrl_algo.training.checkpoint import Run, RunRecord, digest, open_run, write_run
+from tcmrl_algo.training.config import ALGORITHMS, TrainingConfig, validated
+from tcmrl_algo.training.memory import keep_freed_memory
+from tcmrl_algo.training.metrics import MetricsWriter
+from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError, plugin
+
+PACKAGES = ("torch", "numpy")
+"""Whose versions results depend on."""
+REMEDY = (
+    "the last checkpoint, if any, is intact; lower optimizer.learning_rate or bound "
+    "optimizer.gradient_norm with --set"
+)
+"""Against divergence."""
+
+PREFETCHED = 2
+"""Batches that wait ready; results do not depend on it."""
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where a training run stands.
+
+    Attributes:
+        step: steps done.
+        steps: steps to do.
+        rate: steps per second since the last report.
+        data_share: share of that time spent waiting for batches.
+        metrics: of that step.
+    """
+
+    step: int
+    steps: int
+    rate: float
+    data_share: float
+    metrics: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class TrainingReport:
+    """What a finished training run leaves.
+
+    Attributes:
+        run: its folder and record.
+        step: steps done.
+        seconds: wall-clock time of this call.
+        digest: sha256 over all tensors, by which two runs compare.
+    """
+
+    run: Run
+    step: int
+    seconds: float
+    digest: str
+
+
+def ignore(progress: Progress) -> None:
+    """Reports nothing."""
+
+
+def keep_quiet(message: str) -> None:
+    """Says nothing."""
+
+
+def train_run(
+    dataset: Dataset,
+    out: str | Path,
+    *,
+    config: TrainingConfig,
+    profile: str,
+    seed: int = 0,
+    steps: int | None = None,
+    device: str = "cpu",
+    memory_limit: int | None = None,
+    report: Callable[[Progress], None] = ignore,
+    say: Callable[[str], None] = keep_quiet,
+) -> TrainingReport:
+    """Trains a new run.
+
+    Args:
+        dataset: what to learn from; its training tasks alone are used.
+        out: the run's folder, made here.
+        config: the resolved training table.
+        profile: whose table it was; recorded.
+        seed: of everything random.
+        steps: where to stop, instead of `run.steps`; schedules keep the length that `run.steps` gives them.
+        device: a torch device.
+        memory_limit: bytes of data beyond which the cache is used; half of the available memory if None.
+        report: called after every logged step.
+        say: told where data are read from, where that is not memory.
+
+    Raises:
+        CheckpointError: the folder holds a run already.
+        SelectionError: fewer than two training tasks, or too few snapshots or trajectories.
+        TrainingError: an unusable device, or a loss that is not finite.
+
+    Example:
+        >>> dataset = tcmrl_data.open_dataset("data/point-robot")  # doctest: +SKIP
+        >>> config = resolve(dataset.manifest.training["quick"], place="quick")  # doctest: +SKIP
+        >>> train_run(dataset, "runs/first", config=config, profile="quick", seed=1)  # doctest: +SKIP
+    """
+    if (Path(out) / "run.json").exists():
+        raise CheckpointError(f"{out} holds a run already; go on with --resume, or name another --out")
+    batches = open_batches(
+        dataset, config, seed=seed, device=usable_device(device), memory_limit=memory_limit, say=say
+    )
+    record = RunRecord(
+        environment=dataset.name,
+        dataset=str(dataset.folder.resolve()),
+        root=dataset.manifest.root,
+        profile=profile,
+        seed=seed,
+        steps=config.settings.run.steps if steps is None else steps,
+        device=device,
+        config=config,
+        moments=MomentsRecord.of(batches.moments()),
+        versions={name: importlib.metadata.version(name) for name in PACKAGES},
+    )
+    algorithm = create_algorithm(record, dataset)
+    run = write_run(Path(out), record)  # only now: what cannot start leaves nothing behind
+    return _train(run, algorithm, batches, start=0, report=report)
+
+
+def resume_run(
+    out: str | Path,
+    dataset: Dataset,
+    *,
+    steps: int | None = None,
+    device: str | None = None,
+    memory_limit: int | None = None,
+    report: Callable[[Progress], None] = ignore,
+    say: Callable[[str], None] = keep_quiet,
+) -> TrainingReport:
+    """Goes on from a run's newest checkpoint; ends as an uninterrupted run of the same length would have.
+
+    Args:
+        out: the run's folder.
+        dataset: the one it was trained on.
+        steps: another place to stop.
+        device: another device.
+        memory_limit: as for `train_run`.
+        report: called after every logged step.
+        say: as for `train_run`.
+
+    Raises:
+        CheckpointError: no run, another dataset, or already further than `steps`.
+        TrainingError: an unusable device, or a loss that is not finite.
+    """
+    run = open_run(out)
+    run.check_dataset(dataset)
+    changes = {"steps": steps, "device": device, "dataset": str(dataset.folder.resolve())}
+    record = run.record.model_copy(update={key: each for key, each in changes.items() if each is not None})
+    start = run.checkpoints()[-1].step if run.checkpoints() else 0
+    if start > record.steps:
+        raise CheckpointError(f"{out} is at step {start} already, beyond --steps {record.steps}")
+    batches = open_batches(
+        dataset,
+        record.config,
+        seed=record.seed,
+        device=usable_device(record.device),
+        memory_limit=memory_limit,
+        say=say,
+    )
+    algorithm = create_algorithm(record, dataset)
+    if start:
+        algorithm.load_tensors(run.newest().tensors())
+    return _train(write_run(run.folder, record), algorithm, batches, start=start, report=report)
+
+
+def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
+    """A run's algorithm with its networks at their start, for training or for a checkpoint's tensors.
+
+    Raises:
+        TrainingError: an unusable device.
+    """
+    settings = record.config.settings
+    torch.set_num_threads(settings.run.threads)
+    problem = problem_of(
+        dataset.environment,
+        record.moments,
+        seed=record.seed,
+        steps=settings.run.steps,
+        device=usable_device(record.device),
+    )
+    module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
+    config = validated(module.Config, record.config.method, f"[{settings.run.algorithm}]")
+    algorithm: Algorithm = module.create(problem, settings, config)
+    return algorithm
+
+
+def usable_device(name: str) -> torch.device:
+    """The torch device of a name, tried out.
+
+    Raises:
+        TrainingError: it cannot be used here.
+    """
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device)
+    except (RuntimeError, AssertionError) as error:
+        reason = str(error).splitlines()[0]
+        raise TrainingError(f"--device {name!r} cannot be used here: {reason}") from None
+    return device
+
+
+def _train(
+    run: Run,
+    algorithm: Algorithm,
+    batches: Batches,
+    *,
+    start: int,
+    report: Callable[[Progress], None],
+) -> TrainingReport:
+    """The loop: batch n - 1 makes step n."""
+    settings, last = run.record.config.settings.run, run.record.steps
+    keep_freed_memory()
+    began = time.perf_counter()
+    logged_at, logged_step, logged_wait = began, start, 0.0
+    with (
+        MetricsWriter(run.folder, step=start) as writer,
+        Prefetch(batches.batch, range(start, last), depth=PREFETCHED) as stream,
+    ):
+        for step in range(start + 1, last + 1):
+            metrics = algorithm.update(next(stream), step)
+            _check_sizes(metrics, algorithm.limits(), step)
+            if step % settings.log_every == 0 or step == last:
+                values = {name: float(each) for name, each in metrics.items()}
+                now = time.perf_counter()
+                seconds = max(now - logged_at, 1e-9)
+                rate, share = (step - logged_step) / seconds, (stream.waited - logged_wait) / seconds
+                logged_at, logged_step, logged_wait = now, step, stream.waited
+                about = {"data/short_trajectories": float(batches.short_trajectories)}
+                times = {"time/steps_per_second": rate, "time/data_share": share}
+                writer.write(step, values | about | times)
+                report(Progress(step, last, rate, share, values))
+            if step % settings.checkpoint_every == 0 or step == last:
+                _check_finite(algorithm.tensors(), step)
+                run.save(step, algorithm.tensors())
+    return TrainingReport(run, last, time.perf_counter() - began, digest(algorithm.tensors()))
+
+
+def _check_sizes(metrics: Mapping[str, Tensor], limits: Mapping[str, float], step: int) -> None:
+    """Stops training where a metric is NaN or beyond its limit, one synchronisation for all of them.
+
+    Raises:
+        TrainingError: with the first such metric, its value, its limit and the step.
+    """
+    largest = [limits.get(name, sys.float_info.max) for name in metrics]
+    sizes = torch.stack([each.double().abs() for each in metrics.values()]).tolist()
+    for name, size, limit in zip(metrics, sizes, largest, strict=True):
+        if math.isnan(size) or size > limit:
+            what = f"is {size:.3g}, beyond {limit:.3g}," if name in limits else "is not finite"
+            raise TrainingError(f"{name} {what} at step {step}; {REMEDY}")
+
+
+def _check_finite(values: Mapping[str, Tensor], step: int) -> None:
+    """Stops training where a tensor holds NaN or infinity, one synchronisation for all of them.
+
+    Raises:
+        TrainingError: with the first such quantity and the step.
+    """
+    bad = [torch.isfinite(each).all() for each in values.values()]
+    if bool(torch.stack(bad).all()):
+        return
+    name = next(name for name, finite in zip(values, bad, strict=True) if not finite)
+    raise TrainingError(f"{name} is not finite at step {step}; {REMEDY}")

@@ -1,0 +1,96 @@
+"""Checkpoints of behavior training, in `.checkpoints/<unit>/` of a dataset until the unit's last part is out.
+
+A checkpoint is one safetensors file whose name carries its sha256; counters and generator states stand as
+JSON in its header. Nothing is pickled; a damaged or foreign checkpoint is ignored, and training starts again.
+"""
+
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy.typing as npt
+
+from tcmrl_data.foundation.canonical import canonical_json, parse_json, sha256
+from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replace_file
+
+CHECKPOINT_SECONDS = 60.0
+CHECKPOINT_SHARE = 0.05
+"""Most of the time that may go into checkpoints."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """State of a training.
+
+    Attributes:
+        values: JSON; `steps` holds the environment steps done.
+        arrays: name to array.
+    """
+
+    values: Mapping[str, Any]
+    arrays: Mapping[str, npt.NDArray[Any]]
+
+
+class CheckpointFolder:
+    """The latest checkpoint of one task's training.
+
+    Args:
+        dataset: folder of the dataset.
+        unit: names the subfolder.
+        key: digest of everything that the training depends on; a checkpoint with another key is ignored.
+        before: a checkpoint at or after this training step is of no use, since a snapshot is missing there.
+        seconds: time between two checkpoints, at least; 0 for one at every opportunity.
+    """
+
+    def __init__(
+        self, dataset: Path, unit: str, *, key: str, before: float, seconds: float = CHECKPOINT_SECONDS
+    ) -> None:
+        self._dataset, self._folder = dataset, dataset / CHECKPOINTS / unit
+        self._key, self._before = key, before
+        self._seconds, self._saved, self._cost = seconds, time.monotonic(), 0.0
+
+    def is_due(self) -> bool:
+        """It is time for a checkpoint: large ones come more rarely, so that they cost little of the time."""
+        wait = max(self._seconds, self._cost / CHECKPOINT_SHARE) if self._seconds else 0.0
+        return time.monotonic() - self._saved >= wait
+
+    def save(self, checkpoint: Checkpoint) -> None:
+        """Puts a checkpoint in the place of the last one."""
+        from safetensors.numpy import save
+
+        began = time.monotonic()
+        header = canonical_json({"key": self._key, "values": checkpoint.values}).decode()
+        data = save(dict(checkpoint.arrays), metadata={"state": header})
+        earlier = self._files()
+        replace_file(self._folder / f"{sha256(data)}.safetensors", data, staging=self._dataset / STAGING)
+        for file in earlier:
+            file.unlink(missing_ok=True)  # the same unit may run twice at once
+        self._saved = time.monotonic()
+        self._cost = self._saved - began
+
+    def load(self) -> Checkpoint | None:
+        """The last checkpoint, or None where there is none to trust."""
+        from safetensors import SafetensorError
+        from safetensors.numpy import load
+
+        for file in self._files():
+            try:
+                data = file.read_bytes()
+                if sha256(data) != file.stem:
+                    continue
+                header_bytes = int.from_bytes(data[:8], "little")
+                state = parse_json(parse_json(data[8 : 8 + header_bytes])["__metadata__"]["state"].encode())
+                if state["key"] == self._key and state["values"]["steps"] < self._before:
+                    return Checkpoint(state["values"], load(data))
+            except (OSError, ValueError, KeyError, TypeError, SafetensorError):
+                continue
+        return None
+
+    def clear(self) -> None:
+        """Removes the checkpoint."""
+        remove_tree(self._folder)
+
+    def _files(self) -> list[Path]:
+        return sorted(self._folder.glob("*.safetensors"))

@@ -1,0 +1,188 @@
+"""One Stable-Baselines3 SAC per task: its own replay buffer, entropy coefficient and seed."""
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, Literal, SupportsFloat, final
+
+import gymnasium
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from tcmrl_data.behavior._sac_state import capture, restore
+from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
+from tcmrl_data.behavior.snapshot import Snapshot, snapshot_of_sac
+from tcmrl_data.envs.base import Environment
+from tcmrl_data.foundation.seeding import Purpose, keyed_seed
+from tcmrl_data.recipe.tasks import Task
+
+if TYPE_CHECKING:
+    from stable_baselines3 import SAC
+
+NAME = "sac"
+REPORT_EVERY = 100
+"""Updates between two reports of progress."""
+
+
+class Settings(BaseModel):
+    """The `[behavior.sac]` table; names as in Stable-Baselines3's SAC, defaults in the recipes.
+
+    Attributes:
+        hidden: widths of the actor's and the critics' ReLU layers.
+        steps: environment steps of training.
+        warmup: uniform random steps before the first update.
+        snapshots: steps at which the policy is kept: 0 first, then none before the warm-up ends,
+            since they would all be the same untrained policy, and `steps` last.
+        train_frequency: environment steps between updates.
+        gradient_steps: gradient steps per update.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    hidden: tuple[int, ...] = Field(min_length=1)
+    steps: int = Field(ge=1)
+    warmup: int = Field(ge=0)
+    snapshots: tuple[int, ...] = Field(min_length=2)
+    learning_rate: float = Field(gt=0)
+    batch_size: int = Field(ge=1)
+    gamma: float = Field(gt=0, lt=1)
+    tau: float = Field(gt=0, le=1)
+    buffer_size: int = Field(ge=1)
+    train_frequency: int = Field(default=1, ge=1)
+    gradient_steps: int = Field(default=1, ge=1)
+    entropy: Literal["auto"] | float = "auto"
+
+    @model_validator(mode="after")
+    def _snapshots_fit(self) -> "Settings":
+        steps = self.snapshots
+        if steps[0] != 0 or list(steps) != sorted(set(steps)) or steps[-1] != self.steps:
+            raise ValueError(f"snapshots must rise from 0 to steps ({self.steps}), got {list(steps)}")
+        if steps[1] <= self.warmup:
+            raise ValueError(f"snapshot {steps[1]} lies within the warm-up of {self.warmup} random steps")
+        if any(step % self.train_frequency for step in steps):
+            raise ValueError(f"snapshots must be multiples of train_frequency ({self.train_frequency})")
+        return self
+
+
+@final
+class Source(BehaviorSource):
+    """Trains the tasks of a unit one after another."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        return self._settings.snapshots
+
+    @property
+    def training_steps(self) -> int:
+        return self._settings.steps
+
+    def training_bytes(self, environment: Environment, num_tasks: int) -> int:
+        return training_bytes(self._settings, environment, num_agents=1)
+
+    def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
+        for task in context.tasks:
+            yield from ((task, snapshot) for snapshot in self._train(context, task))
+
+    def _train(self, context: BehaviorContext, task: Task) -> Iterator[Snapshot]:
+        """Trains in chunks; between two of them, at an episode's border, the state may be kept.
+
+        SB3's `learn` called in chunks does what one call does, so neither chunks nor checkpoints change
+        a result.
+        """
+        settings, checkpoints = self._settings, context.checkpoints([task])
+        episodes = KeyedResets(context, task)
+        seed = keyed_seed(context.seed, context.environment.name, task.index, Purpose.BEHAVIOR)
+        model = make_model(settings, episodes, seed=seed)
+        steps_done = -1
+        checkpoint = checkpoints.load()
+        if checkpoint is not None:
+            steps_done = restore(model, episodes, checkpoint)
+            context.report(steps_done)
+        for step in settings.snapshots:
+            while model.num_timesteps < step:
+                chunk = min(REPORT_EVERY * settings.train_frequency, step - model.num_timesteps)
+                if checkpoints.is_due():
+                    if episodes.at_border:
+                        checkpoints.save(capture(model, episodes))
+                    else:
+                        chunk = settings.train_frequency
+                model.learn(chunk, reset_num_timesteps=False)
+                context.report(chunk)
+            if step > steps_done:
+                yield snapshot_of_sac(model, step=step, observation=context.observation)
+
+
+def training_bytes(settings: Settings, environment: Environment, *, num_agents: int) -> int:
+    """Most memory that training some agents at once takes.
+
+    What a checkpoint keeps (replay buffers, weights and their moments) counts three times: the checkpoint
+    is a copy of it and the file another.
+    """
+    observation_dim, action_dim = environment.observation_dim, environment.action_dim
+    row = 2 * observation_dim + action_dim + 3
+    replay = min(settings.buffer_size, settings.steps) * row
+    actor = _parameters(observation_dim, settings.hidden, 2 * action_dim)
+    critic = _parameters(observation_dim + action_dim, settings.hidden, 1)
+    kept = replay + 3 * actor + 2 * 4 * critic  # weights and two moments; the critics' targets
+    gradients = actor + 2 * critic
+    activations = 8 * settings.batch_size * (row + sum(settings.hidden))  # both critics, forward and backward
+    return 4 * num_agents * (3 * kept + gradients + activations)
+
+
+def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
+    return sum((before + 1) * after for before, after in pairwise((inputs, *hidden, outputs)))
+
+
+def make_model(settings: Settings, environment: gymnasium.Env[Any, Any], *, seed: int) -> "SAC":
+    """An untrained SAC; seeds the global generators of Python, NumPy and torch, as SB3 does."""
+    from stable_baselines3 import SAC
+    from stable_baselines3.common.logger import Logger
+
+    model = SAC(
+        "MlpPolicy",
+        environment,
+        learning_rate=settings.learning_rate,
+        buffer_size=min(settings.buffer_size, settings.steps),
+        learning_starts=settings.warmup,
+        batch_size=settings.batch_size,
+        tau=settings.tau,
+        gamma=settings.gamma,
+        train_freq=settings.train_frequency,
+        gradient_steps=settings.gradient_steps,
+        ent_coef=settings.entropy,
+        policy_kwargs={"net_arch": list(settings.hidden)},
+        seed=seed,
+        device="cpu",
+    )
+    model.set_logger(Logger(folder=None, output_formats=[]))
+    return model
+
+
+@final
+class KeyedResets(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """Resets the n-th training episode with its own keyed seed, so that episodes never depend on history.
+
+    Attributes:
+        episode: number of the running episode; -1 before the first.
+        at_border: the running episode has no step yet.
+    """
+
+    def __init__(self, context: BehaviorContext, task: Task) -> None:
+        super().__init__(
+            context.environment.make(task.parameters, view=context.observation, reward=context.reward)
+        )
+        self._key = (context.seed, context.environment.name, task.index, Purpose.BEHAVIOR_RESET)
+        self.episode = -1
+        self.at_border = False
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        self.episode += 1
+        self.at_border = True
+        return super().reset(seed=keyed_seed(*self._key, self.episode), options=options)
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        self.at_border = False
+        return super().step(action)

@@ -1,0 +1,251 @@
+"""Behavior policies as files: `policy.json` and, for networks, `policy.safetensors`; nothing is unpickled."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal, final
+
+import numpy as np
+import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from tcmrl_data.envs.base import Controller, Environment, Parameters, View
+from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json, sha256
+from tcmrl_data.foundation.disk import make_folders, write_tree
+from tcmrl_data.foundation.errors import SnapshotError
+from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
+
+if TYPE_CHECKING:
+    import torch
+    from stable_baselines3 import SAC
+
+LOG_STD_RANGE = (-20.0, 2.0)
+"""Clamp of the log standard deviation in Stable-Baselines3's SAC actor."""
+
+
+DESCRIPTION_BYTES = 2**16
+HEADER_BYTES = 2**16
+"""Most that `policy.json`, and the header of `policy.safetensors`, may take."""
+
+
+class _Description(BaseModel):
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    observation: View
+
+
+class GaussianPolicy(_Description):
+    """A squashed Gaussian policy with ReLU layers; its weights are in the safetensors file."""
+
+    kind: Literal["squashed_gaussian"] = "squashed_gaussian"
+    observation_dim: int = Field(ge=1, le=2**16)
+    action_dim: int = Field(ge=1, le=2**16)
+    hidden: tuple[Annotated[int, Field(ge=1, le=2**16)], ...] = Field(max_length=16)
+
+    def shapes(self) -> dict[str, tuple[int, ...]]:
+        """Name and shape of every tensor."""
+        widths = (self.observation_dim, *self.hidden)
+        layers = {f"hidden.{i}": (out, into) for i, (into, out) in enumerate(pairwise(widths))}
+        layers |= dict.fromkeys(("mean", "log_std"), (self.action_dim, widths[-1]))
+        return {f"{name}.weight": shape for name, shape in layers.items()} | {
+            f"{name}.bias": shape[:1] for name, shape in layers.items()
+        }
+
+
+class ScriptedPolicy(_Description):
+    """The environment's own expert plus N(0, noise) on every action."""
+
+    kind: Literal["scripted"] = "scripted"
+    noise: float = Field(ge=0, le=10, allow_inf_nan=False)
+
+
+PolicyDescription = Annotated[GaussianPolicy | ScriptedPolicy, Field(discriminator="kind")]
+_DESCRIPTION: TypeAdapter[GaussianPolicy | ScriptedPolicy] = TypeAdapter(PolicyDescription)
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """A behavior policy of one task at one training step.
+
+    Attributes:
+        step: environment steps trained, or for scripted policies the index from noisiest to cleanest.
+        description: what `policy.json` holds.
+        tensors: weights by name, float32; empty for scripted policies.
+    """
+
+    step: int
+    description: GaussianPolicy | ScriptedPolicy
+    tensors: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
+
+    def digest(self) -> str:
+        """sha256 over the description and every tensor's dtype, shape and bytes."""
+        tensors = {
+            name: [str(array.dtype), list(array.shape), sha256(np.ascontiguousarray(array).data)]
+            for name, array in self.tensors.items()
+        }
+        return digest({"policy": self.description.model_dump(mode="json"), "tensors": tensors})
+
+    def controller(self, environment: Environment, parameters: Sequence[Parameters]) -> Controller:
+        """The policy acting in lanes of the given tasks.
+
+        Raises:
+            SnapshotError: a scripted policy for an environment that has no expert.
+        """
+        if isinstance(self.description, GaussianPolicy):
+            return GaussianController(self.description, self.tensors)
+        controller = environment.scripted(parameters, self.description.noise)
+        if controller is None:
+            raise SnapshotError(f"{environment.name} has no scripted policy; use --behavior sac")
+        return controller
+
+    def files(self) -> dict[str, bytes]:
+        """File name to content."""
+        from safetensors.numpy import save
+
+        files = {"policy.json": canonical_json(self.description.model_dump(mode="json"))}
+        if self.tensors:
+            files["policy.safetensors"] = save(dict(self.tensors))
+        return files
+
+
+def read_snapshot(folder: Path, step: int) -> Snapshot:
+    """The snapshot in a part's folder.
+
+    Raises:
+        SnapshotError: a missing or malformed file, tensors of other names, shapes or dtypes than the
+            description asks for, or weights that are not finite.
+    """
+    try:
+        values = parse_json(read_plain_file(folder / "policy.json", limit=DESCRIPTION_BYTES))
+        description = _DESCRIPTION.validate_json(canonical_json(values))
+    except (OSError, ValueError, ValidationError) as error:
+        raise SnapshotError(
+            f"{folder / 'policy.json'}: not a policy description ({one_line(error)})"
+        ) from None
+    if isinstance(description, ScriptedPolicy):
+        return Snapshot(step, description)
+    return Snapshot(step, description, _read_tensors(folder / "policy.safetensors", description.shapes()))
+
+
+def _read_tensors(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, npt.NDArray[np.float32]]:
+    from safetensors import SafetensorError
+    from safetensors.numpy import load
+
+    weights = sum(int(np.prod(shape)) for shape in shapes.values())
+    try:
+        data = read_plain_file(file, limit=4 * weights + HEADER_BYTES)
+        if len(data) < 4 * weights:
+            raise SnapshotError(f"{file}: {len(data)} bytes, the policy needs {4 * weights}")
+        tensors = load(data)
+    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+        raise SnapshotError(f"{file}: cannot be read as safetensors ({one_line(error)})") from None
+    found = {name: array.shape for name, array in tensors.items()}
+    if found != dict(shapes):
+        names = printable(str(sorted(found)))[:200]
+        raise SnapshotError(f"{file}: tensors {names} do not have the policy's names and shapes")
+    for name, array in tensors.items():
+        if array.dtype != np.float32 or not np.isfinite(array).all():
+            raise SnapshotError(f"{file}: tensor {name!r} must be finite float32")
+    return tensors
+
+
+def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
+    """The actor of a Stable-Baselines3 SAC as a snapshot."""
+    actor = model.policy.actor
+    layers = [layer for layer in actor.latent_pi if hasattr(layer, "weight")]
+    named = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {
+        "mean": actor.mu,
+        "log_std": actor.log_std,
+    }
+    tensors = {
+        f"{name}.{kind}": getattr(layer, kind).detach().cpu().numpy().copy()
+        for name, layer in named.items()
+        for kind in ("weight", "bias")
+    }
+    description = GaussianPolicy(
+        observation=observation,
+        observation_dim=int(tensors["hidden.0.weight"].shape[1]),
+        action_dim=int(tensors["mean.weight"].shape[0]),
+        hidden=tuple(tensors[f"hidden.{i}.bias"].size for i in range(len(layers))),
+    )
+    return Snapshot(step, description, tensors)
+
+
+def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
+    """Takes the actor out of a Stable-Baselines3 zip into a new folder, `policy.json` and its weights.
+
+    The zip holds pickles: reading it runs whatever code its author put there. Only an explicit command
+    calls this, never anything that opens a dataset.
+
+    Args:
+        file: what `SAC.save` wrote.
+        out: folder to make.
+        observation: the view that the policy was trained with.
+
+    Raises:
+        SnapshotError: no SAC with ReLU layers in the file, or the folder exists.
+        StorageError: the disk refuses.
+    """
+    import pickle
+    import zipfile
+
+    from stable_baselines3 import SAC
+    from torch.nn import ReLU
+
+    if out.exists():
+        raise SnapshotError(f"{out} exists; choose another folder")
+    try:
+        model = SAC.load(file, device="cpu")
+        layers = list(model.policy.actor.latent_pi)
+        if not all(isinstance(layer, ReLU) for layer in layers[1::2]):
+            raise SnapshotError(f"{file}: only policies with ReLU layers can be imported")
+        snapshot = snapshot_of_sac(model, step=model.num_timesteps, observation=observation)
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        TypeError,
+        AttributeError,
+        AssertionError,
+        ImportError,
+        RuntimeError,
+        EOFError,
+        pickle.UnpicklingError,
+        zipfile.BadZipFile,
+    ) as error:
+        raise SnapshotError(f"{file}: holds no SAC of Stable-Baselines3 ({one_line(error)})") from None
+    make_folders(out.parent)
+    write_tree(out, snapshot.files())
+    return snapshot
+
+
+@final
+class GaussianController(Controller):
+    """tanh(mean + std * noise), computed as Stable-Baselines3's SAC actor computes it."""
+
+    def __init__(self, description: GaussianPolicy, tensors: Mapping[str, npt.NDArray[np.float32]]) -> None:
+        import torch
+
+        self.view = description.observation
+        self._hidden = range(len(description.hidden))
+        self._tensors = {name: torch.tensor(array) for name, array in tensors.items()}
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        import torch
+
+        with torch.inference_mode():
+            features = torch.tensor(observations, dtype=torch.float32)
+            for i in self._hidden:
+                features = torch.relu(self._linear(f"hidden.{i}", features))
+            mean = self._linear("mean", features)
+            std = torch.clamp(self._linear("log_std", features), *LOG_STD_RANGE).exp()
+            squashed = torch.tanh(mean + torch.from_numpy(noise) * std).numpy()
+        # Stable-Baselines3 scales actions to the box [-1, 1] even where that only rounds the last bit
+        return -1.0 + 0.5 * (squashed + 1.0) * 2.0
+
+    def _linear(self, name: str, features: "torch.Tensor") -> "torch.Tensor":
+        from torch.nn.functional import linear
+
+        return linear(features, self._tensors[f"{name}.weight"], self._tensors[f"{name}.bias"])

@@ -1,0 +1,263 @@
+"""One update of N independent SAC agents at once, each as Stable-Baselines3's SAC makes it.
+
+SAC: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018. The losses are sums over the
+tasks of each task's mean over its batch, so an agent's gradient holds nothing of another agent. Gradients
+are written out (see `_stacked_networks`); tests hold them against autograd, and a lone agent against SB3.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import final
+
+import torch
+from torch import Tensor
+from torch.optim import Adam
+
+from tcmrl_data.behavior.snapshot import LOG_STD_RANGE
+from tcmrl_data.behavior.stacked.networks import StackedNetwork, padded_zeros
+
+SQUASH_EPSILON = 1e-6
+"""Keeps the logarithm of 1 - tanh(u)^2 finite; Stable-Baselines3's value."""
+
+CRITICS = 2
+
+
+@dataclass(frozen=True)
+class Hyperparameters:
+    """What an update depends on; names as in the recipe.
+
+    Attributes:
+        entropy: the fixed coefficient, or None for a learned one whose target is -action_dim.
+    """
+
+    hidden: tuple[int, ...]
+    learning_rate: float
+    batch_size: int
+    gamma: float
+    tau: float
+    entropy: float | None
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """A batch per task.
+
+    Attributes:
+        observations: (N, B, observation_dim).
+        actions: (N, B, action_dim).
+        next_observations: (N, B, observation_dim).
+        rewards: (N, B).
+        terminated: (N, B), 1 where the episode ended for good; a time limit is 0.
+    """
+
+    observations: Tensor
+    actions: Tensor
+    next_observations: Tensor
+    rewards: Tensor
+    terminated: Tensor
+
+
+@dataclass(frozen=True)
+class PolicySample:
+    """Actions a = tanh(u), u = mean + std * noise, of a squashed Gaussian.
+
+    Attributes:
+        actions: (..., action_dim).
+        log_probs: (...,), log density of the actions.
+        scaled_noise: (..., action_dim), du / d log_std; 0 where log_std is clamped.
+        unclamped: (..., action_dim), 1 where log_std lies within its range, else 0.
+    """
+
+    actions: Tensor
+    log_probs: Tensor
+    scaled_noise: Tensor
+    unclamped: Tensor
+
+
+def sample_policy(head: Tensor, noise: Tensor) -> PolicySample:
+    """Samples from the actor's outputs.
+
+    log pi(a) = sum_i [-noise_i^2 / 2 - log std_i - log(2 pi) / 2 - log(1 - a_i^2 + epsilon)]
+
+    Args:
+        head: (..., 2 * action_dim), means and log standard deviations.
+        noise: (..., action_dim), standard normal.
+    """
+    mean, raw = head.chunk(2, dim=-1)
+    log_std = raw.clamp(*LOG_STD_RANGE)
+    scaled_noise = log_std.exp() * noise
+    actions = torch.tanh(mean + scaled_noise)
+    density = -0.5 * noise.square() - log_std - torch.log(1.0 - actions.square() + SQUASH_EPSILON)
+    log_probs = density.sum(dim=-1) - 0.5 * math.log(2.0 * math.pi) * noise.shape[-1]
+    unclamped = (raw == log_std).to(raw.dtype)
+    return PolicySample(actions, log_probs, scaled_noise * unclamped, unclamped)
+
+
+def head_gradient(sample: PolicySample, entropy: Tensor, action_gradient: Tensor) -> Tensor:
+    """Gradient dL / d head of L = mean_B(entropy * log pi(a) - Q(a)), (N, B, 2 * action_dim).
+
+    With s = 1 - a^2: dL/du = entropy * 2 a s / (s + epsilon) - dQ/da * s (over B), which is also dL/d mean;
+    dL/d log_std = dL/du * std * noise - entropy (over B).
+
+    Args:
+        sample: of (N, B) actions.
+        entropy: coefficients (N, 1, 1).
+        action_gradient: dQ/da, (N, B, action_dim).
+    """
+    batch_size = sample.actions.shape[1]
+    slope = 1.0 - sample.actions.square()
+    towards_mean = slope * (2.0 * entropy * sample.actions / (slope + SQUASH_EPSILON) - action_gradient)
+    towards_log_std = towards_mean * sample.scaled_noise - entropy * sample.unclamped
+    return torch.cat([towards_mean, towards_log_std], dim=-1) / batch_size
+
+
+@final
+class StackedSac:
+    """N agents: actors, two critics each with targets, entropy coefficients, and their Adam moments.
+
+    Critic k of agent n is network k * N + n of `critics`.
+    """
+
+    def __init__(
+        self,
+        num_agents: int,
+        observation_dim: int,
+        action_dim: int,
+        *,
+        settings: Hyperparameters,
+        device: torch.device,
+    ) -> None:
+        self.num_agents, self.settings, self.device = num_agents, settings, device
+        self._observation_dim, self._action_dim = observation_dim, action_dim
+        critic_widths = (observation_dim + action_dim, *settings.hidden, 1)
+        self.actors = StackedNetwork(num_agents, (observation_dim, *settings.hidden, 2 * action_dim), device)
+        self.critics = StackedNetwork(CRITICS * num_agents, critic_widths, device)
+        self.targets = StackedNetwork(CRITICS * num_agents, critic_widths, device)
+        # SB3 starts a learned coefficient at 1
+        initial = 0.0 if settings.entropy is None else math.log(settings.entropy)
+        self._log_entropy = padded_zeros(num_agents, device).fill_(initial)
+        self._log_entropy_gradient = torch.zeros_like(self._log_entropy)
+        learned = [] if settings.entropy is not None else [(self._log_entropy, self._log_entropy_gradient)]
+        self._critic_optimizer = self._adam([(self.critics.parameters, self.critics.gradient), *learned])
+        self._actor_optimizer = self._adam([(self.actors.parameters, self.actors.gradient)])
+        self._make_buffers(settings.batch_size)
+
+    def _adam(self, vectors: Sequence[tuple[Tensor, Tensor]]) -> Adam:
+        """Adam over vectors whose gradients lie in given places, its moments already there."""
+        for vector, gradient in vectors:
+            vector.grad = gradient
+        optimizer = Adam([vector for vector, _ in vectors], lr=self.settings.learning_rate, fused=True)
+        optimizer.step()  # gradients are zero: this makes the moments and changes nothing else
+        for state in optimizer.state.values():
+            state["step"].zero_()
+        return optimizer
+
+    def _make_buffers(self, batch_size: int) -> None:
+        networks = CRITICS * self.num_agents
+        self._actor_inputs = torch.zeros(
+            (self.num_agents, 2 * batch_size, self._observation_dim), device=self.device
+        )
+        self._critic_inputs = torch.zeros(
+            (networks, batch_size, self._observation_dim + self._action_dim), device=self.device
+        )
+        self._actor_outputs = self.actors.buffers(2 * batch_size)
+        self._actor_deltas = self.actors.buffers(batch_size)
+        self._critic_outputs = self.critics.buffers(batch_size)
+        self._critic_deltas = self.critics.buffers(batch_size)
+        self._acting = self.actors.buffers(1)
+
+    @property
+    def log_entropy(self) -> Tensor:
+        """Logarithms of the entropy coefficients, (N,)."""
+        return self._log_entropy[: self.num_agents]
+
+    def initialize(self, agent: int, uniform: Callable[[tuple[int, ...]], Tensor]) -> None:
+        """Draws one agent's networks as torch's Linear does: uniform within 1 / sqrt(inputs).
+
+        Args:
+            agent: which one.
+            uniform: draws from [-1, 1) in a given shape.
+        """
+        for network, stack in ((agent, self.actors), *self._critics_of(agent)):
+            for layer in stack.layers:
+                bound = 1.0 / math.sqrt(layer.weight.shape[2])
+                for tensor in (layer.weight, layer.bias):
+                    tensor[network] = bound * uniform(tuple(tensor.shape[1:])).to(self.device)
+        self.targets.parameters.copy_(self.critics.parameters)
+
+    def _critics_of(self, agent: int) -> list[tuple[int, StackedNetwork]]:
+        return [(critic * self.num_agents + agent, self.critics) for critic in range(CRITICS)]
+
+    def act(self, observations: Tensor, noise: Tensor) -> Tensor:
+        """Exploring actions (N, action_dim) for observations (N, observation_dim)."""
+        head = self.actors.forward(observations[:, None], self._acting)[:, 0]
+        return sample_policy(head, noise).actions
+
+    def update(self, batch: Transitions, noise: Tensor) -> None:
+        """One gradient step of every agent.
+
+        Args:
+            batch: B transitions per agent.
+            noise: (N, 2B, action_dim) standard normal, for the observations, then the next ones.
+        """
+        batch_size = self.settings.batch_size
+        entropy = self.log_entropy.exp()[:, None]
+        torch.cat([batch.observations, batch.next_observations], dim=1, out=self._actor_inputs)
+        both = sample_policy(self.actors.forward(self._actor_inputs, self._actor_outputs), noise)
+        now = PolicySample(
+            *(each[:, :batch_size] for each in (both.actions, both.log_probs)),
+            *(each[:, :batch_size] for each in (both.scaled_noise, both.unclamped)),
+        )
+        next_values = self._values(self.targets, batch.next_observations, both.actions[:, batch_size:])
+        soft_values = next_values.amin(dim=0) - entropy * both.log_probs[:, batch_size:]
+        goal = batch.rewards + (1.0 - batch.terminated) * self.settings.gamma * soft_values
+        self._step_critics(batch, goal, now.log_probs)
+        self._step_actors(batch.observations, now, entropy[:, :, None])
+        self.targets.parameters.lerp_(self.critics.parameters, self.settings.tau)
+
+    def _values(self, critics: StackedNetwork, observations: Tensor, actions: Tensor) -> Tensor:
+        """Q of both critics, (2, N, B); inputs and layer outputs stay in the buffers."""
+        halves = self._critic_inputs.view(CRITICS, self.num_agents, *self._critic_inputs.shape[1:])
+        halves[..., : self._observation_dim] = observations
+        halves[..., self._observation_dim :] = actions
+        values = critics.forward(self._critic_inputs, self._critic_outputs)
+        return values.view(CRITICS, self.num_agents, -1)
+
+    def _step_critics(self, batch: Transitions, goal: Tensor, log_probs: Tensor) -> None:
+        """Critic loss sum_k mean_B((Q_k - goal)^2) / 2, entropy loss -log_entropy mean_B(log pi + target)."""
+        values = self._values(self.critics, batch.observations, batch.actions)
+        self._critic_deltas[-1].view_as(values).copy_((values - goal) / goal.shape[1])
+        self.critics.propagate(self._critic_outputs, self._critic_deltas)
+        self.critics.fill_gradient(self._critic_inputs, self._critic_outputs, self._critic_deltas)
+        self._log_entropy_gradient[: self.num_agents] = self._action_dim - log_probs.mean(dim=1)
+        self._critic_optimizer.step()
+
+    def _step_actors(self, observations: Tensor, sample: PolicySample, entropy: Tensor) -> None:
+        """Actor loss mean_B(entropy * log pi - min_k Q_k), with the critics as they are after their step."""
+        batch_size = self.settings.batch_size
+        values = self._values(self.critics, observations, sample.actions)
+        smaller = self._critic_deltas[-1].view_as(values)
+        torch.le(values[0], values[1], out=smaller[0])
+        torch.sub(1.0, smaller[0], out=smaller[1])
+        self.critics.propagate(self._critic_outputs, self._critic_deltas)
+        gradient = self.critics.input_gradient(self._critic_deltas, self._observation_dim)
+        action_gradient = gradient.view(CRITICS, *sample.actions.shape).sum(dim=0)
+        self._actor_deltas[-1].copy_(head_gradient(sample, entropy, action_gradient))
+        outputs = [each[:, :batch_size] for each in self._actor_outputs]
+        self.actors.propagate(outputs, self._actor_deltas)
+        self.actors.fill_gradient(self._actor_inputs[:, :batch_size], outputs, self._actor_deltas)
+        self._actor_optimizer.step()
+
+    def state(self) -> dict[str, Tensor]:
+        """Everything that changes, by name; the tensors themselves, so that writing to them restores it."""
+        tensors = {
+            "actors": self.actors.parameters,
+            "critics": self.critics.parameters,
+            "targets": self.targets.parameters,
+            "log_entropy": self._log_entropy,
+        }
+        for name, optimizer in (("critic", self._critic_optimizer), ("actor", self._actor_optimizer)):
+            for index, state in enumerate(optimizer.state.values()):
+                tensors |= {f"adam.{name}.{index}.{key}": state[key] for key in sorted(state)}
+        return tensors

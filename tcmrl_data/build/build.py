@@ -1,0 +1,138 @@
+"""Building a dataset: choose tasks, refuse what cannot work, run units on an engine, keep what is done."""
+
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tcmrl_data.build.driver import Driver
+from tcmrl_data.build.events import EVENTS, BuildEvent, EventLog
+from tcmrl_data.build.part import part_bytes
+from tcmrl_data.engine.base import BaseEngine
+from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_file, make_folders, remove_abandoned
+from tcmrl_data.foundation.errors import BuildError, StorageError
+from tcmrl_data.foundation.plugins import plugin
+from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.recipe.tasks import Task, choose_tasks
+from tcmrl_data.store.manifest import DATA_VERSION, MANIFEST, read_manifest
+from tcmrl_data.verification.scan import check_work_files
+
+OWN_FILES = {MANIFEST, LOCK, STAGING, CHECKPOINTS, EVENTS, "zarr.json", "tasks"}
+
+
+@dataclass(frozen=True)
+class BuildReport:
+    """What a build did.
+
+    Attributes:
+        built: parts made now.
+        present: parts that were there and whose digests held.
+        failed: one line per unit that failed.
+        root: Merkle root of the dataset as it now stands.
+    """
+
+    dataset: Path
+    built: int
+    present: int
+    failed: tuple[str, ...]
+    seconds: float
+    root: str
+
+
+def build_dataset(
+    recipe: Recipe,
+    out: Path,
+    *,
+    seed: int = 0,
+    tasks: Sequence[int] | None = None,
+    workers: int | None = None,
+    engine: str = "local",
+    address: str | None = None,
+    progress: Callable[[BuildEvent], None] = lambda event: None,
+) -> BuildReport:
+    """Builds what is missing of a dataset; on a finished one it verifies and changes nothing.
+
+    Args:
+        recipe: what to build.
+        out: dataset folder: new, empty, or a dataset of the same recipe and seed, which is extended.
+        seed: root seed of behavior training and rollouts.
+        tasks: indices of the full task set instead of the profile's choice.
+        workers: units run at the same time; as many as the engine has cores where None.
+        engine: an engine's name.
+        address: of the engine's cluster, where it has one.
+        progress: called as the build goes on.
+
+    Raises:
+        BuildError: `out` is no dataset, or one of other settings or another seed.
+        LockedError: another process builds this dataset.
+        StoreError: a published part is damaged.
+        StorageError: too little free space, or the disk refused; what was published stands.
+    """
+    started = time.monotonic()
+    runner: BaseEngine = plugin("tcmrl_data.engine", "engine", engine).Engine(workers, address=address)
+    chosen = choose_tasks(recipe, tasks)
+    _check_folder(out, recipe, seed)
+    make_folders(out)
+    with lock_file(out / LOCK, f"dataset {out}"):
+        remove_abandoned(out)
+        driver = Driver(recipe, out, seed, [*_earlier_tasks(out, recipe), *chosen])
+        _check_space(out, recipe, driver.missing_parts)
+        present = len(driver.parts)
+        failed: tuple[str, ...] = ()
+        if driver.missing_parts:
+            with EventLog(out, progress) as log:
+                failed = driver.run(runner, log)
+        else:
+            driver.write_manifest()
+    seconds = time.monotonic() - started
+    return BuildReport(out, len(driver.parts) - present, present, failed, seconds, driver.root)
+
+
+def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
+    """Refuses a folder that is neither new nor a dataset of this recipe and seed."""
+    if not out.exists():
+        return
+    if not out.is_dir() or {entry.name for entry in out.iterdir()} - OWN_FILES:
+        raise BuildError(f"--out {out} exists and is no dataset; choose another folder")
+    check_work_files(out)
+    if not (out / MANIFEST).is_file():
+        return
+    manifest = read_manifest(out)
+    if manifest.data_version != DATA_VERSION:
+        raise BuildError(
+            f"{out} has data version {manifest.data_version}, not {DATA_VERSION}; use another --out"
+        )
+    if manifest.seed != seed:
+        raise BuildError(f"{out} was built with seed {manifest.seed}, not {seed}; use another --out")
+    other = _first_difference(manifest.recipe.unit_settings(), recipe.unit_settings())
+    if other:
+        raise BuildError(f"{out} was built with other settings: {other}; use another --out")
+
+
+def _first_difference(old: Any, new: Any, path: str = "") -> str | None:
+    if isinstance(old, Mapping) and isinstance(new, Mapping):
+        for key in sorted({*old, *new}):
+            found = _first_difference(old.get(key), new.get(key), f"{path}.{key}" if path else key)
+            if found:
+                return found
+        return None
+    return None if old == new else f"{path} is {old} there and {new} here"
+
+
+def _earlier_tasks(out: Path, recipe: Recipe) -> list[Task]:
+    """Tasks that the dataset already has, built or planned."""
+    if not (out / MANIFEST).is_file():
+        return []
+    return choose_tasks(recipe, [task.index for task in read_manifest(out).tasks])
+
+
+def _check_space(out: Path, recipe: Recipe, num_parts: int) -> None:
+    """Refuses a build that the disk has no room for, arrays counted before compression."""
+    needed, free = num_parts * part_bytes(recipe), shutil.disk_usage(out).free
+    if needed > free:
+        raise StorageError(
+            f"{out}: {num_parts} parts take up to {needed / 1e9:.2f} GB, {free / 1e9:.2f} GB are free; "
+            "make room or build fewer --tasks at a time"
+        )

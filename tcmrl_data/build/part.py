@@ -1,0 +1,200 @@
+"""The making of a part: a snapshot's rollouts, their record, and their publication."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+
+from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.build.provenance import provenance
+from tcmrl_data.envs.base import Controller, Environment, Lanes, UniformController
+from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
+from tcmrl_data.foundation.disk import publish_folder
+from tcmrl_data.foundation.errors import NondeterminismError
+from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
+from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.recipe.tasks import Task
+from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
+from tcmrl_data.store.manifest import (
+    DATA_VERSION,
+    SCHEMA_VERSION,
+    ArrayRecord,
+    FileRecord,
+    Identity,
+    PartRecord,
+    References,
+    part_folder,
+    read_part_record,
+)
+from tcmrl_data.store.statistics import statistics
+
+Report = Callable[[Mapping[str, Any]], None]
+"""Receives `{"kind": "steps", "count"}` and `{"kind": "part", "task", "step", "id"}`."""
+
+
+@final
+class PartMaker:
+    """Rolls out and publishes the snapshots of one task, with one set of lanes.
+
+    Args:
+        dataset: its folder.
+        recipe: how the dataset is built.
+        seed: root seed of the build.
+        environment: the recipe's.
+        task: whose snapshots these are.
+        behavior: what the behavior source has recorded with its parts.
+    """
+
+    def __init__(
+        self,
+        dataset: Path,
+        recipe: Recipe,
+        seed: int,
+        *,
+        environment: Environment,
+        task: Task,
+        behavior: Mapping[str, Any],
+    ) -> None:
+        self.task = task
+        self._behavior = behavior
+        self._dataset, self._recipe, self._seed, self._environment = dataset, recipe, seed, environment
+        self._parameters = [task.parameters] * recipe.rollouts.lanes
+        self._lanes: Lanes | None = None
+        self._references: References | None = None
+
+    def close(self) -> None:
+        """Frees the lanes; closing twice does no harm."""
+        if self._lanes is not None:
+            self._lanes.close()
+            self._lanes = None
+
+    def publish(self, snapshot: Snapshot, report: Report) -> str:
+        """Publishes the part of a snapshot and returns its id."""
+        target = self._dataset / part_folder(self.task.index, snapshot.step)
+        if (target / "part.json").is_file():
+            record = read_part_record(target / "part.json")
+            if record.identity.policy != snapshot.digest():
+                raise NondeterminismError(
+                    f"{target}: its policy differs from the one trained now with the same seed"
+                )
+            return record.id
+        part_id, files = self._make(snapshot)
+        if not publish_folder(self._dataset, target, files, attempt=f"task_{self.task.index:05d}"):
+            published = read_part_record(target / "part.json").id
+            if published != part_id:
+                raise NondeterminismError(
+                    f"{target}: published with id {published}, made again with {part_id}"
+                )
+        report({"kind": "part", "task": self.task.index, "step": snapshot.step, "id": part_id})
+        return part_id
+
+    def _make(self, snapshot: Snapshot) -> tuple[str, dict[str, bytes]]:
+        """The id and all files of the snapshot's part."""
+        environment, task = self._environment, self.task
+        if self._lanes is None:
+            self._lanes = environment.lanes(self._parameters)
+        trajectories = roll_out_part(
+            self._recipe, self._seed, environment=environment, task=task, snapshot=snapshot, lanes=self._lanes
+        )
+        if self._references is None:
+            self._references = self._measure_references()
+        return seal_part(
+            self._recipe,
+            self._seed,
+            task=task,
+            snapshot=snapshot,
+            trajectories=trajectories,
+            references=self._references,
+            provenance=provenance(environment, self._behavior),
+        )
+
+    def _measure_references(self) -> References:
+        """Uniform, oracle and noise-free scripted returns of the task, from one lane batch each."""
+        environment, lanes = self._environment, self._lanes
+        assert lanes is not None
+        key = (self._seed, environment.name, self.task.index)
+        seeds = [keyed_seed(*key, Purpose.REFERENCE_RESET, lane) for lane in range(lanes.num_lanes)]
+
+        def mean_return(controller: Controller | None) -> float | None:
+            if controller is None:
+                return None
+            noise = [keyed_generator(*key, Purpose.REFERENCE_NOISE, lane) for lane in range(lanes.num_lanes)]
+            episodes = roll_out(environment, lanes, controller, reset_seeds=seeds, noise=noise)
+            return float(np.mean([each.undiscounted_return for each in episodes]))
+
+        uniform = mean_return(UniformController())
+        assert uniform is not None
+        return References(
+            uniform=uniform,
+            oracle=mean_return(environment.oracle(self._parameters)),
+            scripted=mean_return(environment.scripted(self._parameters, 0.0)),
+        )
+
+
+def seal_part(
+    recipe: Recipe,
+    seed: int,
+    *,
+    task: Task,
+    snapshot: Snapshot,
+    trajectories: Sequence[Trajectory],
+    references: References,
+    provenance: Mapping[str, Any],
+) -> tuple[str, dict[str, bytes]]:
+    """The id and all files of a part, `part.json` included."""
+    arrays = pack(trajectories)
+    digests = {
+        name: ArrayRecord.model_validate_json(canonical_json(each))
+        for name, each in array_digests(arrays).items()
+    }
+    identity = Identity(
+        schema_version=SCHEMA_VERSION,
+        data_version=DATA_VERSION,
+        settings=recipe.unit_settings(),
+        task=task.index,
+        parameters=dict(task.parameters),
+        step=snapshot.step,
+        seed=seed,
+        policy=snapshot.digest(),
+        arrays=digests,
+    )
+    files = encode_arrays(arrays) | snapshot.files()
+    record = PartRecord(
+        schema_version=SCHEMA_VERSION,
+        id=digest(identity.model_dump(mode="json")),
+        identity=identity,
+        statistics=statistics(trajectories),
+        references=references,
+        files={name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())},
+        provenance=dict(provenance),
+    )
+    return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}
+
+
+def part_bytes(recipe: Recipe) -> int:
+    """Size of a part's arrays before compression, for episodes of full length."""
+    environment = recipe.make_environment()
+    row_bytes = 4 * (environment.observation_dim + environment.action_dim + 1) + 2
+    return recipe.rollouts.episodes * (environment.settings.horizon + 1) * row_bytes
+
+
+def roll_out_part(
+    recipe: Recipe, seed: int, *, environment: Environment, task: Task, snapshot: Snapshot, lanes: Lanes
+) -> list[Trajectory]:
+    """The recipe's episodes of one snapshot, in lane batches; each episode has its own keyed seeds."""
+    controller = snapshot.controller(environment, [task.parameters] * lanes.num_lanes)
+    key = (seed, environment.name, task.index)
+    trajectories: list[Trajectory] = []
+    for first in range(0, recipe.rollouts.episodes, lanes.num_lanes):
+        episodes = range(first, first + lanes.num_lanes)
+        trajectories += roll_out(
+            environment,
+            lanes,
+            controller,
+            reset_seeds=[keyed_seed(*key, Purpose.ROLLOUT_RESET, snapshot.step, each) for each in episodes],
+            noise=[keyed_generator(*key, Purpose.ROLLOUT_NOISE, snapshot.step, each) for each in episodes],
+        )
+    return trajectories

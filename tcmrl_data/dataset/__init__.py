@@ -1,0 +1,1 @@
+"""Reading a dataset: parts, selections, tables of returns."""

@@ -1,0 +1,32 @@
+"""Which datasets lie below a folder."""
+
+from pathlib import Path
+from typing import Any
+
+from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.store.manifest import MANIFEST, read_manifest
+
+
+def list_datasets(root: str | Path) -> list[dict[str, Any]]:
+    """The datasets below a folder: name, tasks, parts, complete, root, path; unreadable ones with `error`."""
+    rows: list[dict[str, Any]] = []
+    for file in sorted(Path(root).glob(f"**/{MANIFEST}")):
+        try:
+            manifest = read_manifest(file)
+        except ManifestError as error:
+            rows.append({"path": str(file.parent), "error": str(error)})
+            continue
+        rows.append(
+            {
+                "path": str(file.parent),
+                "name": manifest.name,
+                "profile": manifest.profile,
+                "behavior": manifest.recipe.behavior["source"],
+                "seed": manifest.seed,
+                "tasks": len(manifest.tasks),
+                "parts": len(manifest.parts),
+                "complete": manifest.complete,
+                "root": manifest.root,
+            }
+        )
+    return rows

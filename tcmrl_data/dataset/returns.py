@@ -1,0 +1,269 @@
+"""Tables of what a dataset holds, as JSON documents, and the learning curves of its tasks.
+
+Returns are undiscounted sums of the stored rewards.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.errors import SelectionError
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+PLOT_FORMATS = (".pdf", ".png", ".svg")
+SPLITS = ("train", "test")
+RETURN_FIELDS = ("episodes", "steps", "mean", "std", "min", "max", "success_rate")
+
+
+def return_table(dataset: Dataset, recompute: bool = False) -> dict[str, Any]:
+    """Returns per task and snapshot, the document of `tcmrl-data inspect returns --json`.
+
+    Args:
+        dataset: the dataset; of an incomplete one, what is there.
+        recompute: sum the stored rewards instead of reading the parts' records.
+
+    Returns:
+        `{"name", "environment", "tasks": [{"task", "split", "snapshots": [{"step", "episodes", "steps",
+        "mean", "std", "min", "max", "success_rate"}]}]}`; mean to max are over a snapshot's episodes, std is
+        the population's, success_rate is null without a success signal.
+
+    Example:
+        >>> import tcmrl_data
+        >>> dataset = tcmrl_data.open_dataset("data/point-robot")  # doctest: +SKIP
+        >>> tcmrl_data.return_table(dataset)["tasks"][0]["split"]  # doctest: +SKIP
+        'train'
+    """
+    return _heading(dataset) | {
+        "tasks": [
+            {
+                "task": task.index,
+                "split": task.split,
+                "snapshots": [
+                    {"step": step} | _returns(dataset, task.index, step, recompute)
+                    for step in dataset.snapshots(task.index)
+                ],
+            }
+            for task in dataset.tasks
+        ]
+    }
+
+
+def task_table(dataset: Dataset) -> dict[str, Any]:
+    """Parameters and reference returns of every task; references are null while a task is incomplete."""
+    references = dataset.manifest.references
+    return _heading(dataset) | {
+        "tasks": [
+            {
+                "task": task.index,
+                "split": task.split,
+                "parameters": dict(task.parameters),
+                "references": references[str(task.index)].model_dump()
+                if str(task.index) in references
+                else None,
+            }
+            for task in dataset.tasks
+        ]
+    }
+
+
+def snapshot_table(dataset: Dataset) -> dict[str, Any]:
+    """Every part: task, split, step, id, episodes, steps and mean return."""
+    rows = []
+    for task in dataset.tasks:
+        for step in dataset.snapshots(task.index):
+            record = dataset.part(task.index, step)
+            rows.append(
+                {
+                    "task": task.index,
+                    "split": task.split,
+                    "step": step,
+                    "id": record.id,
+                    "episodes": record.statistics.episodes,
+                    "steps": record.statistics.steps,
+                    "mean": record.statistics.mean,
+                }
+            )
+    return _heading(dataset) | {"snapshots": rows}
+
+
+def episode_table(dataset: Dataset, *, task: int | None = None, step: int | None = None) -> dict[str, Any]:
+    """Every episode: length, return, how it ended, and whether it succeeded at any step.
+
+    Args:
+        dataset: the dataset.
+        task: only this task.
+        step: only snapshots of this step.
+
+    Raises:
+        TaskError: the dataset does not hold the task.
+        SelectionError: no part is left.
+    """
+    tasks = dataset.tasks if task is None else (dataset.task(task),)
+    parts = [
+        (each.index, found)
+        for each in tasks
+        for found in dataset.snapshots(each.index)
+        if step is None or found == step
+    ]
+    if not parts:
+        raise SelectionError(
+            f"{dataset.folder} has no snapshot of step {step}; its steps are {list(dataset.manifest.steps)}"
+        )
+    rows = [
+        {"task": index, "step": found, "episode": episode} | _episode(trajectory)
+        for index, found in parts
+        for episode, trajectory in enumerate(dataset.trajectories(index, found))
+    ]
+    return _heading(dataset) | {"episodes": rows}
+
+
+def summarize(table: dict[str, Any]) -> list[dict[str, Any]]:
+    """One row per snapshot step and split: mean, std, min, max over the tasks' mean returns.
+
+    Args:
+        table: what `return_table` made.
+    """
+    steps = sorted({found["step"] for task in table["tasks"] for found in task["snapshots"]})
+    rows = []
+    for step in steps:
+        for split in SPLITS:
+            found = list(_at(table, step, split))
+            if not found:
+                continue
+            means = np.array([each["mean"] for each in found])
+            success = [each["success_rate"] for each in found if each["success_rate"] is not None]
+            rows.append(
+                {
+                    "step": step,
+                    "split": split,
+                    "tasks": len(found),
+                    "episodes": sum(each["episodes"] for each in found),
+                    "mean": float(means.mean()),
+                    "std": float(means.std()),
+                    "min": float(means.min()),
+                    "max": float(means.max()),
+                    "success_rate": float(np.mean(success)) if success else None,
+                }
+            )
+    return rows
+
+
+def first_disagreement(recorded: dict[str, Any], recomputed: dict[str, Any]) -> str | None:
+    """Where recomputed returns differ from the recorded ones, in words; None where they agree."""
+    for old, new in zip(recorded["tasks"], recomputed["tasks"], strict=True):
+        for before, after in zip(old["snapshots"], new["snapshots"], strict=True):
+            for field in RETURN_FIELDS:
+                if not _agree(before[field], after[field]):
+                    place = f"task {old['task']} at step {before['step']}"
+                    return f"{place}: {field} is {before[field]} in part.json and {after[field]} in the data"
+    return None
+
+
+def plot_returns(dataset: Dataset, table: dict[str, Any], file: Path) -> None:
+    """Draws the learning curves of all tasks, train and test apart, with oracle and uniform actions.
+
+    Args:
+        dataset: where the references come from.
+        table: what `return_table` made.
+        file: the picture to write; its ending names the format.
+
+    Raises:
+        SelectionError: the ending names no supported format, or the dataset has no parts.
+    """
+    if file.suffix.lower() not in PLOT_FORMATS:
+        raise SelectionError(f"--plot {file}: the name must end in {', '.join(PLOT_FORMATS)}")
+    if not any(task["snapshots"] for task in table["tasks"]):
+        raise SelectionError(f"{dataset.folder} has no parts to plot; build it with `tcmrl-data build`")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    for split, color in zip(SPLITS, ("tab:blue", "tab:orange"), strict=True):
+        _draw_split(axes, table, split, color)
+    _draw_references(axes, dataset)
+    axes.set(xlabel="environment steps of behavior training", ylabel="mean undiscounted return")
+    axes.set_title(f"{dataset.name}: behavior policies of {len(table['tasks'])} tasks")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    figure.savefig(file, dpi=130)
+
+
+def _draw_split(axes: "Axes", table: dict[str, Any], split: str, color: str) -> None:
+    tasks = [task for task in table["tasks"] if task["split"] == split and task["snapshots"]]
+    for task in tasks:
+        steps = [found["step"] for found in task["snapshots"]]
+        axes.plot(
+            steps, [found["mean"] for found in task["snapshots"]], color=color, alpha=0.35, linewidth=0.9
+        )
+    rows = [row for row in summarize(table) if row["split"] == split]
+    if rows:
+        label = f"{split}, mean of {len(tasks)} tasks"
+        axes.plot(
+            [row["step"] for row in rows], [row["mean"] for row in rows], "o-", color=color, label=label
+        )
+
+
+def _draw_references(axes: "Axes", dataset: Dataset) -> None:
+    references = list(dataset.manifest.references.values())
+    for name, line in (("oracle", "--"), ("uniform", ":")):
+        values = [value for each in references if (value := getattr(each, name)) is not None]
+        if values:
+            axes.axhline(
+                float(np.mean(values)), color="0.3", linestyle=line, label=f"{name}, mean of all tasks"
+            )
+
+
+def _heading(dataset: Dataset) -> dict[str, Any]:
+    return {"name": dataset.manifest.name, "environment": dataset.manifest.recipe.environment["name"]}
+
+
+def _returns(dataset: Dataset, task: int, step: int, recompute: bool) -> dict[str, Any]:
+    if not recompute:
+        statistics = dataset.part(task, step).statistics
+        return {field: getattr(statistics, field) for field in RETURN_FIELDS}
+    trajectories = dataset.trajectories(task, step)
+    returns = np.array([each.undiscounted_return for each in trajectories])
+    success = [each for each in map(_success, trajectories) if each is not None]
+    return {
+        "episodes": len(trajectories),
+        "steps": sum(map(len, trajectories)),
+        "mean": float(returns.mean()),
+        "std": float(returns.std()),
+        "min": float(returns.min()),
+        "max": float(returns.max()),
+        "success_rate": float(np.mean(success)) if success else None,
+    }
+
+
+def _episode(trajectory: Trajectory) -> dict[str, Any]:
+    return {
+        "length": len(trajectory),
+        "return": trajectory.undiscounted_return,
+        "terminated": bool(trajectory.terminated.any()),
+        "truncated": bool(trajectory.truncated.any()),
+        "success": _success(trajectory),
+    }
+
+
+def _success(trajectory: Trajectory) -> bool | None:
+    return bool(np.any(trajectory.extras["success"])) if "success" in trajectory.extras else None
+
+
+def _at(table: dict[str, Any], step: int, split: str) -> Iterator[dict[str, Any]]:
+    for task in table["tasks"]:
+        if task["split"] == split:
+            yield from (found for found in task["snapshots"] if found["step"] == step)
+
+
+def _agree(recorded: float | None, recomputed: float | None) -> bool:
+    if recorded is None or recomputed is None:
+        return recorded is recomputed
+    return bool(np.isclose(recorded, recomputed, rtol=1e-9, atol=1e-9))

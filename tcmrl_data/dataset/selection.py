@@ -1,0 +1,123 @@
+"""Some tasks and snapshots of a dataset: what exports, samplers and evaluations read."""
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.recipe.tasks import Task
+
+if TYPE_CHECKING:
+    from tcmrl_data.dataset.dataset import Dataset
+    from tcmrl_data.interchange.views.torch_dataset import TrajectoryDataset
+    from tcmrl_data.sampling.sampler import BatchSizes, Sampler
+
+
+def chosen_steps(dataset: "Dataset", task: int, rule: str) -> tuple[int, ...]:
+    """Snapshot steps of a task that a rule of `Dataset.select` leaves, ascending.
+
+    Raises:
+        SelectionError: the task is incomplete, the rule cannot be read, or nothing is left.
+    """
+    steps = dataset.snapshots(task)
+    missing = sorted(set(dataset.manifest.steps) - set(steps))
+    if missing:
+        raise SelectionError(
+            f"{dataset.folder}: task {task} lacks snapshots {missing}; finish it with `tcmrl-data build`"
+        )
+    match = re.fullmatch(r"all|last|steps>=(\d+)|return>=(0(?:\.\d+)?|1(?:\.0+)?)", rule.replace(" ", ""))
+    if match is None:
+        raise SelectionError(
+            f"snapshots {rule!r}: expected all, last, steps>=N or return>=Q with Q in [0, 1]"
+        )
+    if rule == "last":
+        steps = steps[-1:]
+    elif match[1]:
+        steps = [step for step in steps if step >= int(match[1])]
+    elif match[2]:
+        means = {step: dataset.part(task, step).statistics.mean for step in steps}
+        threshold = np.quantile(list(means.values()), float(match[2]))
+        steps = [step for step in steps if means[step] >= threshold]
+    if not steps:
+        raise SelectionError(
+            f"{dataset.folder}: snapshots {rule!r} leaves nothing of task {task}, "
+            f"which has {list(dataset.manifest.steps)}"
+        )
+    return tuple(steps)
+
+
+@dataclass(frozen=True)
+class Selection:
+    """Some tasks and snapshots of a dataset; a view, nothing is loaded.
+
+    Attributes:
+        dataset: where it comes from.
+        tasks: the selected tasks.
+        steps: task index to snapshot steps.
+    """
+
+    dataset: "Dataset"
+    tasks: tuple[Task, ...]
+    steps: dict[int, tuple[int, ...]]
+
+    def to_torch_dataset(self, *, kept_parts: int | None = None) -> "TrajectoryDataset":
+        """The selected episodes as a map-style `torch.utils.data.Dataset`; parts are read when asked for.
+
+        Args:
+            kept_parts: parts that stay in memory after they were read; all of them where None.
+        """
+        from tcmrl_data.interchange.views.torch_dataset import TrajectoryDataset
+
+        return TrajectoryDataset(self, kept_parts=kept_parts)
+
+    def trajectories(self, task: int) -> list[Trajectory]:
+        """All selected episodes of a task, snapshot by snapshot."""
+        return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
+
+    def sampler(
+        self,
+        sizes: "BatchSizes",
+        *,
+        seed: int,
+        stream: int = 0,
+        device: str = "cpu",
+        memory_limit: int | None = None,
+        say: Callable[[str], None] = lambda message: None,
+    ) -> "Sampler":
+        """Loads the selection once and serves meta-training batches from it.
+
+        Args:
+            sizes: what a batch holds.
+            seed: of the run; batch n is a function of (seed, stream, n).
+            stream: further streams of batches under the same seed.
+            device: where batches are to be.
+            memory_limit: bytes that the decoded steps may take in memory, half of what is available if left
+                out; larger selections are decoded into the cache once and read from there.
+            say: told when the cache is used.
+
+        Raises:
+            SelectionError: the selection holds test tasks, fewer than two tasks, or too little of one.
+        """
+        from tcmrl_data.sampling.cache import load_rows
+        from tcmrl_data.sampling.sampler import Sampler
+
+        test = [task.index for task in self.tasks if task.split == "test"]
+        if test:
+            raise SelectionError(f"test tasks {test} must not be trained on; select split='train'")
+        if len(self.tasks) < 2:
+            raise SelectionError(
+                f"meta-training needs at least 2 training tasks, the selection has {len(self.tasks)}"
+            )
+        return Sampler(
+            load_rows(self, memory_limit=memory_limit, say=say),
+            sizes,
+            seed=seed,
+            stream=stream,
+            environment=self.dataset.name,
+            place=str(self.dataset.folder),
+            device=device,
+        )

@@ -1,0 +1,94 @@
+"""Engines run units somewhere, one engine a file: each module has NAME and a class Engine."""
+
+import abc
+from collections.abc import Callable, Generator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from tcmrl_data.foundation.errors import BuildError
+
+ATTEMPTS = 2
+"""A unit that crashed or ran out of time is tried once more; an error that it reports itself is final."""
+
+Message = Callable[[str, Mapping[str, Any]], None]
+"""Receives (unit id, message) as units report; messages tell of progress, and may get lost."""
+
+
+@dataclass(frozen=True)
+class Unit:
+    """Work for one process; running it twice does no harm.
+
+    Attributes:
+        id: names the unit in messages and logs.
+        spec: JSON, understood by the worker.
+        worker: the module that does it, run as a process of its own; it serves by `serve`.
+        threads: of that process's libraries.
+        cost: relative length, for starting the longest first.
+        cpus: cores to reserve, on engines that know several machines.
+        gpus: graphics processors to reserve there; a fraction shares one.
+        memory: bytes to reserve there.
+        timeout: seconds after which an attempt is ended; None for no limit.
+    """
+
+    id: str
+    spec: Mapping[str, Any]
+    worker: str = "tcmrl_data.engine.worker"
+    threads: int = 1
+    cost: float = 1.0
+    cpus: float = 1.0
+    gpus: float = 0.0
+    memory: int = 0
+    timeout: float | None = None
+
+
+@dataclass(frozen=True)
+class Result:
+    """How a unit ended.
+
+    Attributes:
+        id: the unit.
+        ok: it is done.
+        digest: digest over the unit's part ids, where ok.
+        error: one line, where not ok.
+        attempt: attempts made, from 1.
+        node: host that ran the last attempt.
+    """
+
+    id: str
+    ok: bool
+    digest: str | None
+    error: str | None
+    attempt: int
+    node: str
+
+
+class BaseEngine(abc.ABC):
+    """Runs units, each at least once, in any order.
+
+    Args:
+        workers: units at a time; as many as there is room for where None.
+        address: of the machines to work on, for engines that reach others.
+
+    Raises:
+        BuildError: the engine takes no address.
+    """
+
+    takes_address = False
+
+    def __init__(self, workers: int | None = None, *, address: str | None = None) -> None:
+        if address is not None and not self.takes_address:
+            raise BuildError(f"this engine takes no address, got {address!r}; leave it out or choose ray")
+        self.workers, self.address = workers, address
+
+    @abc.abstractmethod
+    def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
+        """Yields one result per unit as units end; closing the iterator ends what still runs.
+
+        Raises:
+            BuildError: a unit asks for more than any machine has; nothing was started.
+        """
+
+
+def longest_first(units: Sequence[Unit]) -> list[Unit]:
+    """The units in the order in which they are started: the last one to end should be a short one."""
+    return sorted(units, key=lambda unit: -unit.cost)

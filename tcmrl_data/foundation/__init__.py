@@ -1,0 +1,1 @@
+"""What everything stands on: errors, seeds, canonical JSON, safe file operations, plug-ins."""

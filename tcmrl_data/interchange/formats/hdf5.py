@@ -1,0 +1,184 @@
+"""HDF5, one file per task: flat arrays in the manner of D4RL, and one group per episode.
+
+```
+/observations /actions /rewards /next_observations    (N, …) float32, all episodes behind one another
+/terminals /timeouts                                  (N,) bool; a time limit is never a terminal
+/episode /step                                        (N,) int64: number of the episode, its snapshot's step
+/success …                                            (N,) further per-step arrays, where the dataset has them
+/episodes/000000/{observations (T + 1, …), actions, rewards, terminated, truncated, …}
+```
+
+Attributes of the file name the environment, the task with its parameters and split, the seed, and the
+dataset it came from.
+"""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.selection import Selection
+from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.interchange.formats._new_folder import new_folder
+from tcmrl_data.recipe.tasks import Task
+
+if TYPE_CHECKING:
+    import h5py
+
+NAME = "hdf5"
+FORMAT_VERSION = 1
+EPISODE_ARRAYS = ("observations", "actions", "rewards", "terminated", "truncated")
+CHUNK_ROWS = 4_096
+
+
+def export(
+    dataset: Dataset,
+    out: Path,
+    *,
+    snapshots: str = "all",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Writes one HDF5 file per task into a new folder, one part in memory at a time.
+
+    The folder appears under its name when all files are complete, and not at all when something fails.
+
+    Args:
+        dataset: a complete dataset.
+        out: the folder to make; an empty one may stand there.
+        snapshots: a rule of `Dataset.select`.
+        progress: called with the number of parts written and of all parts.
+
+    Returns:
+        The files, `task_00000.hdf5` and so on.
+
+    Raises:
+        SelectionError: the rule cannot be read or leaves nothing of a task, or the dataset is incomplete.
+        StoreError: `out` exists and is not empty.
+    """
+    selection = dataset.select(snapshots=snapshots)
+    total = sum(len(steps) for steps in selection.steps.values())
+    done = 0
+    with new_folder(out) as folder:
+        for task in selection.tasks:
+            for _ in _write_task(selection, task, folder / _file_name(task)):
+                done += 1
+                progress(done, total)
+    return [out / _file_name(task) for task in selection.tasks]
+
+
+def read_hdf5(path: str | Path) -> list[Trajectory]:
+    """The episodes of a file that `export` wrote, in order.
+
+    Raises:
+        StoreError: the file is missing, no HDF5, or of another format version.
+
+    Example:
+        >>> from tcmrl_data.interchange.formats.hdf5 import read_hdf5
+        >>> episodes = read_hdf5("data/point-robot-hdf5/task_00000.hdf5")  # doctest: +SKIP
+    """
+    import h5py
+
+    try:
+        with h5py.File(path, "r") as file:
+            version = file.attrs.get("format_version")
+            if version != FORMAT_VERSION or "episodes" not in file:
+                raise StoreError(
+                    f"{path}: format_version {version} is not {FORMAT_VERSION}, which this version reads"
+                )
+            return [_read_episode(group) for _, group in sorted(file["episodes"].items())]
+    except OSError as error:
+        raise StoreError(f"{path} does not open as HDF5 ({error}); export the dataset again") from None
+
+
+def _file_name(task: Task) -> str:
+    return f"task_{task.index:05d}.hdf5"
+
+
+def _write_task(selection: Selection, task: Task, path: Path) -> Iterator[int]:
+    """Writes a task part by part; yields the step of every part written."""
+    import h5py
+
+    with h5py.File(path, "x") as file:
+        file.attrs.update(_attributes(selection, task))
+        groups = file.create_group("episodes")
+        for step in selection.steps[task.index]:
+            trajectories = selection.dataset.trajectories(task.index, step)
+            first = len(groups)
+            _append(file, _flat(trajectories, first=first, step=step))
+            for index, trajectory in enumerate(trajectories, start=first):
+                _write_episode(groups.create_group(f"{index:06d}"), trajectory, step)
+            yield step
+
+
+def _attributes(selection: Selection, task: Task) -> Mapping[str, Any]:
+    manifest = selection.dataset.manifest
+    return {
+        "format": "tcmrl-hdf5",
+        "format_version": FORMAT_VERSION,
+        "environment": manifest.name,
+        "task": task.index,
+        "split": task.split,
+        "parameters": json.dumps(dict(task.parameters), sort_keys=True),
+        "seed": manifest.seed,
+        "snapshots": np.array(selection.steps[task.index], dtype=np.int64),
+        "dataset_root": manifest.root,
+        "recipe": json.dumps(manifest.recipe.unit_settings(), sort_keys=True),
+        "citation": manifest.recipe.about.citation,
+        "licence": manifest.recipe.about.licence,
+    }
+
+
+def _flat(trajectories: Sequence[Trajectory], *, first: int, step: int) -> dict[str, npt.NDArray[np.generic]]:
+    """Transitions of a part behind one another; `first` numbers its first episode."""
+    lengths = [len(each) for each in trajectories]
+    arrays: dict[str, npt.NDArray[np.generic]] = {
+        "observations": np.concatenate([each.observations[:-1] for each in trajectories]),
+        "next_observations": np.concatenate([each.observations[1:] for each in trajectories]),
+        "actions": np.concatenate([each.actions for each in trajectories]),
+        "rewards": np.concatenate([each.rewards for each in trajectories]),
+        "terminals": np.concatenate([each.terminated for each in trajectories]),
+        "timeouts": np.concatenate([each.truncated for each in trajectories]),
+        "episode": np.repeat(np.arange(first, first + len(lengths), dtype=np.int64), lengths),
+        "step": np.full(sum(lengths), step, dtype=np.int64),
+    }
+    extras = {name: [each.extras[name] for each in trajectories] for name in trajectories[0].extras}
+    return arrays | {name: np.concatenate(values) for name, values in extras.items()}
+
+
+def _append(file: "h5py.File", arrays: Mapping[str, npt.NDArray[np.generic]]) -> None:
+    for name, array in arrays.items():
+        if name not in file:
+            file.create_dataset(
+                name,
+                shape=(0, *array.shape[1:]),
+                maxshape=(None, *array.shape[1:]),
+                dtype=array.dtype,
+                chunks=(CHUNK_ROWS, *array.shape[1:]),
+                compression="gzip",
+                compression_opts=1,
+                shuffle=True,
+                fletcher32=True,
+            )
+        rows = len(file[name])
+        file[name].resize(rows + len(array), axis=0)
+        file[name][rows:] = array
+
+
+def _write_episode(group: "h5py.Group", trajectory: Trajectory, step: int) -> None:
+    group.attrs["step"] = step
+    group.attrs["return"] = trajectory.undiscounted_return
+    arrays = {name: getattr(trajectory, name) for name in EPISODE_ARRAYS} | dict(trajectory.extras)
+    for name, array in arrays.items():
+        group.create_dataset(name, data=array)
+
+
+def _read_episode(group: "h5py.Group") -> Trajectory:
+    arrays = {name: np.asarray(values[()]) for name, values in group.items()}
+    extras = {name: array for name, array in arrays.items() if name not in EPISODE_ARRAYS}
+    observations, actions, rewards, terminated, truncated = (arrays[name] for name in EPISODE_ARRAYS)
+    return Trajectory(observations, actions, rewards, terminated, truncated, extras)

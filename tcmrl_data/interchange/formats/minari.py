@@ -1,0 +1,201 @@
+"""Minari, one dataset per task, named `tcmrl/<environment>/task00007-<snapshots>-v0`.
+
+The folder is a root of Minari datasets: with MINARI_DATASETS_PATH naming it, `minari.load_dataset` opens
+them by their names. Episodes come snapshot by snapshot; each carries the seed that its environment was
+reset with, and as metadata its snapshot's step. Further arrays such as `success` are infos with one row
+more than actions, as Minari has them: the first row is of the reset.
+
+`ref_min_score` is the return of uniform actions; `ref_max_score` that of a controller that knows the task,
+else of the environment's expert, else of the best snapshot, and `ref_max_score_source` says of which.
+`recover_environment` gives the task back as a Gymnasium environment.
+"""
+
+import contextlib
+import json
+import os
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.spaces import Box
+
+from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.selection import Selection
+from tcmrl_data.envs.base import make_environment
+from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.errors import MissingPackageError, StoreError
+from tcmrl_data.foundation.seeding import Purpose, keyed_seed
+from tcmrl_data.interchange.formats._new_folder import new_folder
+from tcmrl_data.recipe.tasks import Task
+from tcmrl_data.store.manifest import TaskReferences
+
+if TYPE_CHECKING:
+    from minari.data_collector import EpisodeBuffer
+
+NAME = "minari"
+NEEDED_BY_TASKS = ("tcmrl", "gymnasium", "mujoco", "metaworld")
+"""Packages without which a task cannot be made again."""
+
+
+def export(
+    dataset: Dataset,
+    out: Path,
+    *,
+    snapshots: str = "all",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Path]:
+    """Writes one Minari dataset per task below a new folder, one part in memory at a time.
+
+    The folder appears under its name when all datasets are complete, and not at all when something fails.
+    While it is written, MINARI_DATASETS_PATH of this process names another folder.
+
+    Args:
+        dataset: a complete dataset.
+        out: the folder to make; an empty one may stand there.
+        snapshots: a rule of `Dataset.select`.
+        progress: called with the number of parts written and of all parts.
+
+    Returns:
+        The files.
+
+    Raises:
+        SelectionError: the rule cannot be read or leaves nothing of a task, or the dataset is incomplete.
+        StoreError: `out` exists and is not empty, or an episode has no steps.
+        MissingPackageError: Minari is not installed.
+
+    Example:
+        >>> import minari  # doctest: +SKIP
+        >>> minari.load_dataset("tcmrl/point-robot/task00000-last-v0")  # doctest: +SKIP
+    """
+    try:
+        import minari  # noqa: F401
+    except ImportError as error:
+        raise MissingPackageError(
+            f"format 'minari' needs a package that is missing ({error}); pip install 'tcmrl[minari]'"
+        ) from None
+    selection = dataset.select(snapshots=snapshots)
+    total = sum(len(steps) for steps in selection.steps.values())
+    done = 0
+    with new_folder(out) as folder, _datasets_path(folder):
+        for task in selection.tasks:
+            for _ in _write_task(selection, task, dataset_id(dataset, task.index, snapshots)):
+                done += 1
+                progress(done, total)
+    return sorted(path for path in out.rglob("*") if path.is_file())
+
+
+def dataset_id(dataset: Dataset, task: int, snapshots: str = "all") -> str:
+    """The name of a task's Minari dataset; a rule's `>=` and `.` become `-ge-` and `_`."""
+    rule = snapshots.replace(" ", "").replace(">=", "-ge-").replace(".", "_")
+    return f"tcmrl/{dataset.name}/task{task:05d}-{rule}-v0"
+
+
+def make_task(settings: Mapping[str, Any], parameters: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
+    """The entry point by which Gymnasium makes an exported task again.
+
+    Args:
+        settings: the recipe's `[environment]` table.
+        parameters: of the task.
+    """
+    return make_environment(settings).make(parameters)
+
+
+@contextlib.contextmanager
+def _datasets_path(folder: Path) -> Iterator[None]:
+    """Makes a folder the root of Minari's datasets; Minari takes it from the process's environment only."""
+    before = os.environ.get("MINARI_DATASETS_PATH")
+    os.environ["MINARI_DATASETS_PATH"] = str(folder.resolve())  # Minari trips over a relative one
+    try:
+        yield
+    finally:
+        del os.environ["MINARI_DATASETS_PATH"]
+        if before is not None:
+            os.environ["MINARI_DATASETS_PATH"] = before
+
+
+def _write_task(selection: Selection, task: Task, name: str) -> Iterator[int]:
+    """Writes a task part by part; yields the step of every part written."""
+    import minari
+
+    dataset, steps = selection.dataset, selection.steps[task.index]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "`.*` is set to None", UserWarning)  # author, link: not ours to say
+        written = minari.create_dataset_from_buffers(name, [], **_description(selection, task))
+    source, _ = _best(dataset.references(task.index))
+    written.storage.update_metadata({"ref_max_score_source": source, "dataset_root": dataset.manifest.root})
+    for step in steps:
+        trajectories = dataset.trajectories(task.index, step)
+        first = written.total_episodes
+        written.update_dataset_from_buffer(
+            [_buffer(dataset, task, step, index, each) for index, each in enumerate(trajectories)]
+        )
+        written.storage.update_episode_metadata(
+            [{"snapshot_step": step}] * len(trajectories), range(first, first + len(trajectories))
+        )
+        yield step
+
+
+def _description(selection: Selection, task: Task) -> dict[str, Any]:
+    """What Minari keeps of a task's dataset beside its episodes."""
+    dataset = selection.dataset
+    environment, recipe = dataset.environment, dataset.manifest.recipe
+    spec = EnvSpec(
+        id=f"tcmrl/{dataset.name.replace('/', '-')}-task{task.index:05d}-v0",
+        entry_point=f"{__name__}:{make_task.__name__}",
+        kwargs={"settings": dict(recipe.environment), "parameters": dict(task.parameters)},
+    )
+    references = dataset.references(task.index)
+    packages = dataset.part(task.index, selection.steps[task.index][0]).provenance["packages"]
+    return {
+        "env": spec,
+        "eval_env": spec,
+        "observation_space": Box(-np.inf, np.inf, (environment.observation_dim,), np.float32),
+        "action_space": Box(-1.0, 1.0, (environment.action_dim,), np.float32),
+        "algorithm_name": recipe.behavior["source"],
+        "ref_min_score": references.uniform,
+        "ref_max_score": _best(references)[1],
+        "num_episodes_average_score": recipe.rollouts.lanes,
+        "requirements": [f"{each}=={packages[each]}" for each in NEEDED_BY_TASKS if each in packages],
+        "description": (
+            f"Task {task.index} of {dataset.name} ({task.split}), parameters "
+            f"{json.dumps(dict(task.parameters), sort_keys=True)}. {recipe.about.description} "
+            f"Source: {recipe.about.citation}. Licence: {recipe.about.licence}. "
+            f"Exported from the dataset with root {dataset.manifest.root}."
+        ),
+    }
+
+
+def _best(references: TaskReferences) -> tuple[str, float]:
+    """What the highest reference score is of, and the score."""
+    if references.oracle is not None:
+        return "oracle", references.oracle
+    if references.scripted is not None:
+        return "scripted", references.scripted
+    return "behavior", references.behavior
+
+
+def _buffer(dataset: Dataset, task: Task, step: int, episode: int, trajectory: Trajectory) -> "EpisodeBuffer":
+    from minari.data_collector import EpisodeBuffer
+
+    if not len(trajectory):
+        raise StoreError(
+            f"{dataset.folder_of(task.index, step)}: episode {episode} has no steps, which Minari cannot "
+            "hold; export with --format hdf5"
+        )
+    key = (dataset.manifest.seed, dataset.name, task.index)
+    return EpisodeBuffer(
+        seed=keyed_seed(*key, Purpose.ROLLOUT_RESET, step, episode),
+        observations=trajectory.observations,
+        actions=trajectory.actions,
+        rewards=trajectory.rewards,
+        terminations=trajectory.terminated,
+        truncations=trajectory.truncated,
+        infos={
+            name: np.concatenate([np.zeros(1, values.dtype), values])
+            for name, values in trajectory.extras.items()
+        },
+    )

@@ -1,0 +1,1 @@
+"""Selections as objects of other libraries, one library a file."""

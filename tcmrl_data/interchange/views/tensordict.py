@@ -1,0 +1,128 @@
+"""TensorDicts with TorchRL's keys."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from tcmrl_data.dataset.selection import Selection
+from tcmrl_data.foundation.errors import MissingPackageError
+
+if TYPE_CHECKING:
+    import torch
+    from tensordict import TensorDict
+
+    from tcmrl_data.sampling.sampler import Steps
+
+
+def to_tensordict(selection: Selection) -> "TensorDict":
+    """All selected transitions in memory, episodes behind one another, batch size (N,).
+
+    Keys as in TorchRL's offline datasets: `observation`, `action`, `done`, `terminated`, `truncated` (False:
+    no transition starts where an episode ended), `("next", "observation")`, `("next", "reward")`,
+    `("next", "done")`, `("next", "terminated")`, `("next", "truncated")`; rewards and flags are (N, 1).
+    Beside them, (N,) int64: `episode`, which numbers episodes over all tasks (the `traj_key` of TorchRL's
+    slice samplers), `task`, and `step`, that of the episode's snapshot.
+
+    Raises:
+        MissingPackageError: tensordict is not installed.
+
+    Example:
+        >>> from tcmrl_data.interchange.views.tensordict import to_tensordict
+        >>> from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler  # doctest: +SKIP
+        >>> data = to_tensordict(dataset.select(snapshots="last"))  # doctest: +SKIP
+        >>> sampler = SliceSampler(slice_len=10, traj_key="episode")  # doctest: +SKIP
+        >>> buffer = ReplayBuffer(storage=LazyTensorStorage(len(data)), sampler=sampler)  # doctest: +SKIP
+        >>> buffer.extend(data)  # doctest: +SKIP
+    """
+    import torch
+
+    kind = _tensordict_type()
+    episodes = [
+        (task.index, step, trajectory)
+        for task in selection.tasks
+        for step in selection.steps[task.index]
+        for trajectory in selection.dataset.trajectories(task.index, step)
+    ]
+    lengths = [len(each) for _, _, each in episodes]
+
+    def flat(arrays: list[Any]) -> "torch.Tensor":
+        return torch.from_numpy(np.concatenate(arrays))
+
+    def numbered(numbers: list[int]) -> "torch.Tensor":
+        return torch.from_numpy(np.repeat(np.array(numbers, dtype=np.int64), lengths))
+
+    result: TensorDict = kind(
+        {
+            "observation": flat([each.observations[:-1] for _, _, each in episodes]),
+            "action": flat([each.actions for _, _, each in episodes]),
+            "next": _outcome(
+                flat([each.observations[1:] for _, _, each in episodes]),
+                flat([each.rewards for _, _, each in episodes]),
+                flat([each.terminated for _, _, each in episodes]),
+                flat([each.truncated for _, _, each in episodes]),
+            ),
+            **{name: torch.zeros(sum(lengths), 1, dtype=torch.bool) for name in _FLAGS},
+            "episode": numbered(list(range(len(episodes)))),
+            "task": numbered([task for task, _, _ in episodes]),
+            "step": numbered([step for _, step, _ in episodes]),
+        },
+        batch_size=[sum(lengths)],
+    )
+    return result
+
+
+def view_steps(steps: "Steps") -> "TensorDict":
+    """Steps of a batch under TorchRL's keys, sharing their memory; the batch size is their leading shape.
+
+    A batch does not know time limits, so `("next", "done")` is `("next", "terminated")` and
+    `("next", "truncated")` is False. `mask` is False on padding.
+
+    Raises:
+        MissingPackageError: tensordict is not installed.
+    """
+    import torch
+
+    kind = _tensordict_type()
+    terminated = steps.terminated.bool()
+    result: TensorDict = kind(
+        {
+            "observation": steps.observations,
+            "action": steps.actions,
+            "next": _outcome(
+                steps.next_observations, steps.rewards, terminated, torch.zeros_like(terminated)
+            ),
+            **{name: torch.zeros_like(terminated).unsqueeze(-1) for name in _FLAGS},
+            "mask": steps.mask,
+        },
+        batch_size=steps.rewards.shape,
+    )
+    return result
+
+
+_FLAGS = ("done", "terminated", "truncated")
+
+
+def _outcome(
+    observations: "torch.Tensor",
+    rewards: "torch.Tensor",
+    terminated: "torch.Tensor",
+    truncated: "torch.Tensor",
+) -> dict[str, "torch.Tensor"]:
+    """What follows an action: the `next` entries."""
+    return {
+        "observation": observations,
+        "reward": rewards.unsqueeze(-1),
+        "done": (terminated | truncated).unsqueeze(-1),
+        "terminated": terminated.unsqueeze(-1),
+        "truncated": truncated.unsqueeze(-1),
+    }
+
+
+def _tensordict_type() -> Any:
+    try:
+        from tensordict import TensorDict
+    except ImportError as error:
+        raise MissingPackageError(
+            f"TensorDicts need a package that is missing ({error}); pip install 'tcmrl[tensordict]'"
+        ) from None
+    return TensorDict

@@ -1,0 +1,111 @@
+"""Tasks of an environment: indices, parameters, and the split that never moves."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any, Literal
+
+import numpy as np
+
+from tcmrl_data.envs.base import Environment
+from tcmrl_data.foundation.errors import TaskError
+from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
+from tcmrl_data.recipe.recipe import Recipe
+
+Split = Literal["train", "test"]
+
+
+@dataclass(frozen=True)
+class Task:
+    """One member of an environment.
+
+    Attributes:
+        index: position in the full task set; means the same task in every profile and selection.
+        split: `train` or `test`.
+        parameters: JSON values that rebuild the task without drawing anything again.
+    """
+
+    index: int
+    split: Split
+    parameters: Mapping[str, Any]
+
+
+def draw_tasks(environment: Environment) -> tuple[Task, ...]:
+    """All tasks of an environment, a function of its settings alone (its `task_seed`, never `--seed`)."""
+    settings = environment.settings
+    parameters = environment.draw_parameters(settings.tasks, settings.task_seed)
+    permutation = keyed_generator(settings.task_seed, environment.name, NO_TASK, Purpose.SPLIT).permutation(
+        settings.tasks
+    )
+    train = set(permutation[: settings.train].tolist())
+    return tuple(
+        Task(index, "train" if index in train else "test", parameters[index])
+        for index in range(settings.tasks)
+    )
+
+
+def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]:
+    """Indices of `num_train` training and `num_test` test tasks, each evenly spaced within its split.
+
+    The first and the last task of each split are taken, so that a smaller selection spans the same range.
+
+    Raises:
+        TaskError: a split has fewer tasks than asked for.
+    """
+    chosen: list[int] = []
+    for split, number in (("train", num_train), ("test", num_test)):
+        members = [task.index for task in tasks if task.split == split]
+        if number > len(members):
+            raise TaskError(f"{number} {split} tasks asked for, the task set has {len(members)}")
+        positions = np.linspace(0, len(members) - 1, number).round().astype(int)
+        chosen.extend(members[position] for position in positions)
+    return sorted(chosen)
+
+
+def choose_tasks(recipe: Recipe, indices: Sequence[int] | None = None) -> list[Task]:
+    """The named tasks, or those that the recipe's profile chooses, ascending.
+
+    Raises:
+        TaskError: an index outside the task set, or a profile that asks for more tasks than there are.
+    """
+    tasks = draw_tasks(recipe.make_environment())
+    if indices is None:
+        num_train, num_test = (
+            sum(task.split == split for task in tasks) if asked is None else asked
+            for split, asked in (("train", recipe.build.train_tasks), ("test", recipe.build.test_tasks))
+        )
+        indices = spread(tasks, num_train=num_train, num_test=num_test)
+    for index in indices:
+        if not 0 <= index < len(tasks):
+            raise TaskError(f"task index {index} does not exist, the tasks are 0-{len(tasks) - 1}")
+    return [tasks[index] for index in sorted(set(indices))]
+
+
+def group_tasks(tasks: Iterable[Task], group_size: int) -> list[tuple[Task, ...]]:
+    """The tasks, ascending, put together where index // group_size is equal.
+
+    A group thus depends on the recipe and on which tasks are asked for, never on the machine.
+    """
+    ordered = sorted(tasks, key=lambda task: task.index)
+    return [tuple(group) for _, group in groupby(ordered, key=lambda task: task.index // group_size)]
+
+
+def parse_indices(text: str, num_tasks: int, *, option: str = "--tasks") -> list[int]:
+    """Indices named by text such as `0-9,12`, sorted.
+
+    Raises:
+        TaskError: the text is no list of indices and ranges, or an index lies outside the task set; the
+            message names the option that the text came from.
+    """
+    indices: set[int] = set()
+    for item in text.split(","):
+        first, dash, last = item.strip().partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise TaskError(f"{option} {text!r}: {item!r} is neither an index nor a range such as 0-9")
+        start, stop = int(first), int(last or first)
+        if stop < start:
+            raise TaskError(f"{option} {text!r}: the range {item!r} runs backwards")
+        if stop >= num_tasks:
+            raise TaskError(f"{option} {text!r}: {stop} is too large, 0-{num_tasks - 1} are possible")
+        indices.update(range(start, stop + 1))
+    return sorted(indices)
