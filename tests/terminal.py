@@ -1,0 +1,92 @@
+"""Commands run in a real pseudo-terminal of a given width, and what fits into one."""
+
+import fcntl
+import os
+import pty
+import re
+import struct
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
+"""Colours, cursor moves and the like."""
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What a command left in its terminals, without control codes.
+
+    Attributes:
+        code: its exit code.
+        output: standard output, a terminal of its own.
+        errors: standard error, another terminal of the same width.
+    """
+
+    code: int
+    output: str
+    errors: str
+
+
+def in_terminal(
+    program: str, *arguments: object, columns: int = 80, env: Mapping[str, str] | None = None
+) -> Shown:
+    """Runs an installed program, such as `tcmrl`, in pseudo-terminals of so many columns and 24 rows.
+
+    Args:
+        program: a script of this Python's installation.
+        arguments: what follows the program's name.
+        columns: width of both terminals.
+        env: changes of the environment variables.
+    """
+    script = Path(sys.executable).with_name(program)
+    inherited = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
+    output, errors = _Terminal(columns), _Terminal(columns)
+    finished = subprocess.run(
+        [sys.executable, str(script), *map(str, arguments)],
+        stdin=output.device,
+        stdout=output.device,
+        stderr=errors.device,
+        env=inherited | {"TERM": "xterm"} | dict(env or {}),
+        check=False,
+    )
+    return Shown(finished.returncode, output.close(), errors.close())
+
+
+def assert_fits(text: str, columns: int = 80) -> None:
+    """No line is longer than the terminal is wide, and nothing in it was cut."""
+    for line in text.splitlines():
+        assert len(line) <= columns, f"{len(line)} columns: {line!r}"
+    assert "…" not in text, text
+
+
+class _Terminal:
+    """One pseudo-terminal, read as the command writes, so that a full buffer never stops it."""
+
+    def __init__(self, columns: int) -> None:
+        self._driver, self.device = pty.openpty()
+        fcntl.ioctl(self.device, termios.TIOCSWINSZ, struct.pack("HHHH", 24, columns, 0, 0))
+        self._found: list[bytes] = []
+        self._reader = threading.Thread(target=self._read)
+        self._reader.start()
+
+    def _read(self) -> None:
+        while True:
+            try:
+                found = os.read(self._driver, 65536)
+            except OSError:  # Linux reports EIO when the last writer has gone
+                return
+            if not found:
+                return
+            self._found.append(found)
+
+    def close(self) -> str:
+        os.close(self.device)
+        self._reader.join()
+        os.close(self._driver)
+        text = b"".join(self._found).decode().replace("\r\n", "\n")
+        return CONTROL.sub("", text)
