@@ -9,6 +9,10 @@ class UnknownNameError(TcmrlError):
     """A name of an environment, behavior source, engine, format or algorithm that does not exist."""
 
 
+class PluginError(TcmrlError):
+    """A plug-in that cannot be used: its import fails, it is of the wrong type, or its name is taken."""
+
+
 class RecipeError(TcmrlError):
     """A recipe, profile or `--set` override that does not validate."""
 

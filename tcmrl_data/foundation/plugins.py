@@ -1,12 +1,106 @@
-"""Plug-ins are files: what a folder holds is what there is."""
+"""Plug-ins: classes that installed packages declare as entry points, found without importing them."""
 
 import difflib
+import functools
 import importlib
+import inspect
 import pkgutil
+import sys
 from collections.abc import Iterable
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from types import ModuleType
+from typing import Generic, TypeVar
 
-from tcmrl_data.foundation.errors import UnknownNameError
+from tcmrl_data.foundation.errors import PluginError, UnknownNameError
+
+Kind = TypeVar("Kind")
+
+
+class Registry(Generic[Kind]):
+    """The plug-ins of one kind, by name; listing names imports none of them.
+
+    Args:
+        group: the entry points' group, such as `tcmrl.engines`.
+        noun: what error messages call a plug-in of this kind.
+        base: the class that every plug-in of this kind derives from.
+
+    Example:
+        >>> from tcmrl_data.engine.base import ENGINES
+        >>> ENGINES.get("local").name
+        'local'
+    """
+
+    def __init__(self, group: str, noun: str, base: type[Kind]) -> None:
+        self.group, self.noun, self.base = group, noun, base
+
+    def names(self) -> list[str]:
+        """The declared names, sorted; broken plug-ins included."""
+        return sorted(self._entries())
+
+    def get(self, name: str) -> type[Kind]:
+        """The class behind a name; no other plug-in is imported.
+
+        Raises:
+            UnknownNameError: no package declares the name; the message lists the nearest names.
+            PluginError: the plug-in cannot be imported, is no usable subclass of the base class, or two
+                packages declare its name.
+        """
+        entries = self._entries()
+        if name not in entries:
+            raise unknown_name(self.noun, name, entries)
+        entry, *others = entries[name]
+        if others:
+            packages = " and ".join(sorted(_package(declared) for declared in entries[name]))
+            raise PluginError(f"{self.noun} {name!r} is declared by {packages}; uninstall one of them")
+        problem = f"{self.noun} {name!r} of package {_package(entry)} is broken"
+        try:
+            found = entry.load()
+        except (Exception, SystemExit) as error:  # importing a module may raise anything
+            raise PluginError(f"{problem}: {_one_line(error)}; repair or uninstall the package") from error
+        if defect := self._defect(found, name):
+            raise PluginError(f"{problem}: {entry.value} {defect}; repair or uninstall the package")
+        plugin: type[Kind] = found
+        return plugin
+
+    def broken(self) -> dict[str, str]:
+        """The error of every plug-in that `get` refuses, by name; imports all plug-ins of this kind."""
+        errors = {}
+        for name in self.names():
+            try:
+                self.get(name)
+            except PluginError as error:
+                errors[name] = str(error)
+        return errors
+
+    def _entries(self) -> dict[str, list[EntryPoint]]:
+        found: dict[str, list[EntryPoint]] = {}
+        for entry in _declared(self.group, tuple(sys.path)):
+            found.setdefault(entry.name, []).append(entry)
+        return found
+
+    def _defect(self, found: object, name: str) -> str | None:
+        """Why a loaded object cannot be used, or None where it can."""
+        if not (isinstance(found, type) and issubclass(found, self.base)):
+            return f"is no subclass of {self.base.__module__}.{self.base.__qualname__}"
+        if inspect.isabstract(found):
+            missing: frozenset[str] = getattr(found, "__abstractmethods__", frozenset())
+            return f"does not define {', '.join(sorted(missing))}"
+        own_name = getattr(found, "name", None)
+        return None if own_name == name else f"has the name {own_name!r}, but is declared as {name!r}"
+
+
+@functools.lru_cache
+def _declared(group: str, path: tuple[str, ...]) -> EntryPoints:
+    """A group's entry points below `sys.path`; reading them takes about 20 ms."""
+    return entry_points(group=group)
+
+
+def _package(entry: EntryPoint) -> str:
+    return repr(entry.dist.name if entry.dist else "unknown")
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def modules(package: str) -> list[ModuleType]:
@@ -32,7 +126,9 @@ def plugin(package: str, kind: str, name: str) -> ModuleType:
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """An error that names what was asked for and what comes nearest."""
+    """An error that contains the unknown name and the nearest known names."""
     names = sorted(known)
+    if not names:
+        return UnknownNameError(f"unknown {kind} {name!r}; none is installed, install tcmrl again")
     nearest = difflib.get_close_matches(name, names, n=3, cutoff=0.4) or names[:8]
     return UnknownNameError(f"unknown {kind} {name!r}; did you mean {', '.join(nearest)}?")
