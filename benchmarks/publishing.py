@@ -16,8 +16,9 @@ from typing import Any
 import torch
 
 import tcmrl_data
-from tcmrl_data import canonical, publish
 from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.foundation import canonical
+from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import Disk, make_folders
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import part_folder

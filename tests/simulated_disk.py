@@ -12,8 +12,10 @@ from typing import Literal
 import pytest
 
 import tcmrl_data
-from tcmrl_data import BuildReport, Dataset, Recipe, TcmrlError, build, publish
+from tcmrl_data import BuildReport, Dataset, Recipe, TcmrlError
+from tcmrl_data.build import build
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
+from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import Disk, publish_folder
 from tcmrl_data.store.manifest import part_folder
 

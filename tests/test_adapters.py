@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from tcmrl_data import BatchSizes, Dataset, Purpose, Selection, Trajectory, keyed_seed
 from tcmrl_data.foundation.errors import MissingPackageError, SelectionError, StoreError
-from tcmrl_data.interchange import minari as minari_format
+from tcmrl_data.interchange.formats import minari as minari_format
 from tcmrl_data.interchange.views.sb3_buffer import to_sb3_buffer
 from tcmrl_data.interchange.views.tensordict import to_tensordict, view_steps
 from tests.conftest import TASKS

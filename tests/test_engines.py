@@ -17,7 +17,8 @@ import pytest
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
 from tcmrl_data.build.unit import UnitSpec
-from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit, _attempt
+from tcmrl_data.engine import _attempt
+from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import BuildError

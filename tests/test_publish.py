@@ -11,8 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from tcmrl_data import Dataset, Recipe, build, open_dataset, publish
+from tcmrl_data import Dataset, Recipe, open_dataset
+from tcmrl_data.build import build
 from tcmrl_data.build.driver import check_part
+from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, lock_holder, publish_folder, remove_abandoned
 from tcmrl_data.foundation.errors import LockedError, StorageError, TcmrlError
 from tcmrl_data.store.layout import GROUP

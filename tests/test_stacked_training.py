@@ -305,7 +305,7 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
     spec = canonical_json(UnitSpec(tmp_path, recipe, 0, tasks).to_json()).decode()
     program = (
         "import json, resource, sys\n"
-        "from tcmrl_data import checkpoints\n"
+        "from tcmrl_data.behavior import checkpoints\n"
         "from tcmrl_data.build.unit import UnitSpec, run_unit\n"
         "checkpoints.CheckpointFolder.is_due = lambda self: True\n"
         "run_unit(UnitSpec.from_json(json.load(sys.stdin)), lambda message: None)\n"

@@ -8,9 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from tcmrl_data import Dataset, Trajectory
-from tcmrl_data import store as store_module
 from tcmrl_data.foundation.disk import write_tree
 from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.store import arrays as store_module
 from tcmrl_data.store.arrays import array_files, encode_arrays, pack, read_arrays, unpack
 from tests.strategies import trajectories
 
