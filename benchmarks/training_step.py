@@ -22,7 +22,8 @@ from torch.utils.flop_counter import FlopCounterMode
 
 from tcmrl_algo import ContextAlgorithm
 from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.training.config import ALGORITHMS, TrainingSettings
+from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.training.config import ALGORITHMS
 from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_data import Batch, Steps, plugin
 

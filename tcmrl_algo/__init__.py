@@ -15,14 +15,16 @@ if TYPE_CHECKING:
     from tcmrl_algo.experiment.results import RunResult
     from tcmrl_algo.methods.problem import Algorithm, Problem
     from tcmrl_algo.reporting.write import Report, write_report
+    from tcmrl_algo.settings.training import TrainingSettings
     from tcmrl_algo.training.checkpoint import Run, RunRecord, open_run
-    from tcmrl_algo.training.config import TrainingConfig, TrainingSettings, resolve
+    from tcmrl_algo.training.config import TrainingConfig, resolve
     from tcmrl_algo.training.train import Progress, TrainingReport, create_algorithm, resume_run, train_run
 
 _HOMES = {
     "experiment.aggregate": ("Summary", "summarize"),
     "training.checkpoint": ("Run", "RunRecord", "open_run"),
-    "training.config": ("TrainingConfig", "TrainingSettings", "resolve"),
+    "settings.training": ("TrainingSettings",),
+    "training.config": ("TrainingConfig", "resolve"),
     "context_methods.learner": ("ContextAlgorithm",),
     "adaptation.evaluate": ("Evaluation", "TaskResult", "evaluate_run"),
     "experiment.config": ("Experiment", "experiment_names", "load_experiment"),

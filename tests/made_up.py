@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.training.config import TrainingSettings
+from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, Steps, Trajectory
 
 TASKS, EPISODE = 3, 6

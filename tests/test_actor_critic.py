@@ -1,12 +1,15 @@
 """The offline actor-critic: bounds, who trains whom, targets, BRAC."""
 
 from dataclasses import replace
+from types import ModuleType
 
 import pytest
 import torch
 
-from tcmrl_algo.actor_critic import actor_critic as module
-from tcmrl_algo.actor_critic.actor_critic import ActorCritic, ActorCriticSettings, value_bounds
+from tcmrl_algo.actor_critic import actor_critic as actor_critic_module
+from tcmrl_algo.actor_critic import brac as brac_module
+from tcmrl_algo.actor_critic.actor_critic import ActorCritic, value_bounds
+from tcmrl_algo.settings.actor_critic import ActorCriticSettings
 from tests.made_up import TASKS, problem, steps
 
 
@@ -79,7 +82,7 @@ def test_dual_critic_tells_a_far_policy_from_behavior_and_alpha_rises() -> None:
 def test_value_mode_lowers_each_states_target_by_its_own_divergence(monkeypatch: pytest.MonkeyPatch) -> None:
     seen: dict[str, list[torch.Tensor]] = {}
 
-    def spy(name: str, place: int) -> None:
+    def spy(module: ModuleType, name: str, place: int) -> None:
         real = getattr(module, name)
 
         def call(*arguments: torch.Tensor, **named: float) -> torch.Tensor:
@@ -89,9 +92,9 @@ def test_value_mode_lowers_each_states_target_by_its_own_divergence(monkeypatch:
 
         monkeypatch.setattr(module, name, call)
 
-    spy("value_loss", 1)  # the targets of V
-    spy("q_loss", 3)  # V(s'), as Q's targets see it
-    spy("dual_divergence", -1)
+    spy(actor_critic_module, "value_loss", 1)  # the targets of V
+    spy(actor_critic_module, "q_loss", 3)  # V(s'), as Q's targets see it
+    spy(brac_module, "dual_divergence", -1)
     for mode in ("policy", "value"):
         made = ActorCriticSettings.model_validate({"hidden": (8,), "brac": {"mode": mode, "alpha": 7.0}})
         actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))

@@ -16,7 +16,7 @@ from tcmrl_algo import Evaluation, evaluate_run, resolve, train_run
 from tcmrl_algo.adaptation.evaluate import contexts_of_others
 from tcmrl_algo.adaptation.protocols import PROTOCOLS, Arena
 from tcmrl_algo.methods.problem import Algorithm, Metrics
-from tcmrl_algo.training.config import RunSettings
+from tcmrl_algo.settings.run import RunSettings
 from tcmrl_data import (
     Batch,
     CheckpointError,

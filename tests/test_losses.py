@@ -7,6 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tcmrl_algo.losses import actor_critic
 from tcmrl_algo.losses import context as losses
 
 YES = torch.tensor([[True, True]])
@@ -62,13 +63,13 @@ DIFFERENTIABLE: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
     ),
     "orthogonality": (losses.orthogonality_loss, (random(2, 3),)),
     "q": (
-        lambda q: losses.q_loss(q, NOISE[0], torch.zeros(3).double(), NOISE[1], gamma=0.9),
+        lambda q: actor_critic.q_loss(q, NOISE[0], torch.zeros(3).double(), NOISE[1], gamma=0.9),
         (random(2, 3),),
     ),
-    "value": (lambda v: losses.value_loss(v, NOISE[0]), (random(3),)),
-    "policy": (lambda p, q: losses.policy_loss(p, q, entropy=0.3), (random(3), random(3, seed=1))),
-    "dual_divergence": (losses.dual_divergence, (random(3), random(3, seed=1))),
-    "gradient_penalty": (lambda g: losses.gradient_penalty(2.0 * g), (random(3, 4),)),
+    "value": (lambda v: actor_critic.value_loss(v, NOISE[0]), (random(3),)),
+    "policy": (lambda p, q: actor_critic.policy_loss(p, q, entropy=0.3), (random(3), random(3, seed=1))),
+    "dual_divergence": (actor_critic.dual_divergence, (random(3), random(3, seed=1))),
+    "gradient_penalty": (lambda g: actor_critic.gradient_penalty(2.0 * g), (random(3, 4),)),
 }
 
 
@@ -232,7 +233,7 @@ def test_orthogonality_by_hand() -> None:
 
 def test_q_loss_by_hand() -> None:
     q_values = torch.tensor([[1.0, 2.0], [0.0, 3.0]])
-    loss = losses.q_loss(
+    loss = actor_critic.q_loss(
         q_values, torch.tensor([1.0, 3.0]), torch.tensor([0.0, 1.0]), torch.tensor([2.0, 100.0]), gamma=0.5
     )
     assert loss.item() == 3.0  # targets 2 and 3: (1 + 1) / 2 + (4 + 0) / 2
@@ -241,26 +242,28 @@ def test_q_loss_by_hand() -> None:
 def test_targets_get_no_gradient() -> None:
     bootstrap, target = random(3), random(3, seed=1)
     zeros = torch.zeros(3, dtype=torch.float64)
-    losses.q_loss(random(2, 3), zeros, zeros, bootstrap, gamma=0.9).backward()
-    losses.value_loss(random(3), target).backward()
+    actor_critic.q_loss(random(2, 3), zeros, zeros, bootstrap, gamma=0.9).backward()
+    actor_critic.value_loss(random(3), target).backward()
     assert bootstrap.grad is None
     assert target.grad is None
 
 
 def test_value_and_policy_loss_by_hand() -> None:
-    assert losses.value_loss(torch.tensor([1.0, 3.0]), torch.tensor([2.0, 1.0])).item() == 2.5
-    loss = losses.policy_loss(torch.tensor([1.0, 3.0]), torch.tensor([4.0, 2.0]), entropy=0.5)
+    assert actor_critic.value_loss(torch.tensor([1.0, 3.0]), torch.tensor([2.0, 1.0])).item() == 2.5
+    loss = actor_critic.policy_loss(torch.tensor([1.0, 3.0]), torch.tensor([4.0, 2.0]), entropy=0.5)
     assert loss.item() == -2.0  # ((0.5 - 4) + (1.5 - 2)) / 2
 
 
 def test_dual_divergence_is_zero_where_the_estimated_ratio_is_one() -> None:
     one = torch.full((5,), math.log(math.e - 1.0), dtype=torch.float64)  # softplus gives 1
-    assert losses.dual_divergence(one, one).tolist() == pytest.approx([0.0] * 5, abs=1e-12)
+    assert actor_critic.dual_divergence(one, one).tolist() == pytest.approx([0.0] * 5, abs=1e-12)
     two = torch.full((5,), math.log(math.e**2 - 1.0), dtype=torch.float64)
-    assert losses.dual_divergence(one, two).tolist() == pytest.approx([math.log(2.0)] * 5)
-    assert torch.isfinite(losses.dual_divergence(one, torch.full((5,), -1e4, dtype=torch.float64))).all()
+    assert actor_critic.dual_divergence(one, two).tolist() == pytest.approx([math.log(2.0)] * 5)
+    assert torch.isfinite(
+        actor_critic.dual_divergence(one, torch.full((5,), -1e4, dtype=torch.float64))
+    ).all()
 
 
 def test_gradient_penalty_starts_above_norm_one() -> None:
     gradients = torch.tensor([[3.0, 4.0], [0.3, 0.4]])
-    assert losses.gradient_penalty(gradients).item() == pytest.approx(8.0)  # ((5 - 1)^2 + 0) / 2
+    assert actor_critic.gradient_penalty(gradients).item() == pytest.approx(8.0)  # ((5 - 1)^2 + 0) / 2

@@ -8,19 +8,17 @@ import torch
 from torch import Tensor, nn
 
 from tcmrl_algo.context_methods.encoding import ContextEncoder
+from tcmrl_algo.networks.attention import TaskExtractor, uniform_attention
 from tcmrl_algo.networks.perceptron import (
     LARGEST_INPUT,
     Perceptron,
     PerceptronEnsemble,
-    RewardEstimator,
     Standardizer,
-    TaskExtractor,
     call_frozen,
     set_hidden_dtype,
-    side_by_side,
-    uniform_attention,
 )
-from tcmrl_algo.networks.policy import GaussianPolicy
+from tcmrl_algo.networks.policy import PolicyNetwork
+from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
 from tests.made_up import problem, steps
 
 
@@ -152,7 +150,7 @@ def test_standardizer_leaves_constant_dimensions_undivided_and_bounds_the_rest()
 
 
 def test_log_std_stays_in_range_and_keeps_its_gradient() -> None:
-    policy = GaussianPolicy(1, 1, hidden=(), log_std_range=(-5.0, 0.0), generator=generator())
+    policy = PolicyNetwork(1, 1, hidden=(), log_std_range=(-5.0, 0.0), generator=generator())
     with torch.no_grad():
         policy.perceptron.layers[0].weight.copy_(torch.tensor([[0.0], [1.0]]))
         policy.perceptron.layers[0].bias.zero_()
@@ -168,7 +166,7 @@ def test_log_std_stays_in_range_and_keeps_its_gradient() -> None:
 
 def test_log_probability_is_that_of_the_squashed_action() -> None:
     """By change of variables, with the density of tanh(u) checked against a numerical integral."""
-    policy = GaussianPolicy(1, 1, hidden=(), log_std_range=(-20.0, 0.0), generator=generator())
+    policy = PolicyNetwork(1, 1, hidden=(), log_std_range=(-20.0, 0.0), generator=generator())
     inputs = torch.full((20_001, 1), 0.3)
     mean, log_std = policy(inputs[:1])
     actions = torch.linspace(-0.99999, 0.99999, 20_001).unsqueeze(-1)
@@ -180,7 +178,7 @@ def test_log_probability_is_that_of_the_squashed_action() -> None:
 
 
 def test_log_probability_is_finite_far_out() -> None:
-    policy = GaussianPolicy(1, 1, hidden=(), log_std_range=(-20.0, 0.0), generator=generator())
+    policy = PolicyNetwork(1, 1, hidden=(), log_std_range=(-20.0, 0.0), generator=generator())
     sample = policy.sample(torch.full((2, 1), 0.0), torch.tensor([[60.0], [-60.0]]))
     assert torch.isfinite(sample.log_probabilities).all()
     assert math.isclose(sample.actions.abs().max().item(), 1.0)

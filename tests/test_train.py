@@ -15,9 +15,13 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_algo
 from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
-from tcmrl_algo.actor_critic.actor_critic import ActorCriticSettings, BracSettings
 from tcmrl_algo.algorithms import tcmrl as tcmrl_module
-from tcmrl_algo.training.config import ALGORITHMS, OptimizerSettings, RunSettings, TrainingSettings
+from tcmrl_algo.settings.actor_critic import ActorCriticSettings
+from tcmrl_algo.settings.brac import BracSettings
+from tcmrl_algo.settings.optimizer import OptimizerSettings
+from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.training.config import ALGORITHMS
 from tcmrl_algo.training.train import Progress
 from tcmrl_data import BatchSizes, CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
 from tcmrl_data.foundation.plugins import modules

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 
 from tcmrl_algo.adaptation.protocols import PROTOCOLS, Adaptation, Arena, Context, Report, ignore_progress
+from tcmrl_algo.settings.run import Protocol, RunSettings
 from tcmrl_algo.training.checkpoint import Run, open_run
-from tcmrl_algo.training.config import Protocol, RunSettings
 from tcmrl_algo.training.train import create_algorithm
 from tcmrl_data import Dataset, Task, TrainingError, Trajectory, open_dataset
 

@@ -7,7 +7,7 @@ from typing import final
 import numpy as np
 
 from tcmrl_algo.methods.problem import Algorithm
-from tcmrl_algo.training.config import Protocol, RunSettings
+from tcmrl_algo.settings.run import Protocol, RunSettings
 from tcmrl_data import (
     Controller,
     Dataset,

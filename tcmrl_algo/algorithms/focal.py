@@ -11,8 +11,8 @@ from tcmrl_algo.context_methods.encoding import ContextEncoder
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.problem import Algorithm, Problem
-from tcmrl_algo.networks.perceptron import mean_representation
-from tcmrl_algo.training.config import TrainingSettings
+from tcmrl_algo.networks.attention import mean_representation
+from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchSizes, Steps
 
 NAME = "focal"

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.methods.problem import Algorithm, Problem
-from tcmrl_algo.training.config import TrainingSettings
+from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchSizes, Steps
 
 NAME = "no_context"

@@ -7,19 +7,14 @@ from jaxtyping import Bool, Float
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
 
-from tcmrl_algo.context_methods.encoding import ContextEncoder, Transitions
+from tcmrl_algo.context_methods.encoding import ContextEncoder, EncoderInputs
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.problem import Algorithm, Metrics, Problem
-from tcmrl_algo.networks.perceptron import (
-    Attention,
-    RewardEstimator,
-    TaskExtractor,
-    call_frozen,
-    side_by_side,
-    uniform_attention,
-)
-from tcmrl_algo.training.config import TrainingSettings
+from tcmrl_algo.networks.attention import Attention, TaskExtractor, uniform_attention
+from tcmrl_algo.networks.perceptron import call_frozen
+from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
+from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchSizes, Steps
 
 NAME = "tcmrl"
@@ -168,7 +163,7 @@ class TcmrlLearner(ContextLearner):
         return result
 
     def _reward_losses(
-        self, attention: Attention, execution: Transitions, generator: torch.Generator
+        self, attention: Attention, execution: EncoderInputs, generator: torch.Generator
     ) -> Metrics:
         """Eq. 7 and 8, or 17 and 18; rewards in standard deviations, and returns divided by the horizon.
 

@@ -13,7 +13,7 @@ from tcmrl_data import Steps
 
 
 @dataclass(frozen=True)
-class Transitions:
+class EncoderInputs:
     """Standardised transitions of trajectories, or of windows.
 
     Attributes:
@@ -66,13 +66,13 @@ class ContextEncoder(nn.Module):
         self.scaling = Standardizer(mean, std)
         self.perceptron = Perceptron((len(mean), *hidden, latent), generator=generator)
 
-    def read(self, steps: Steps) -> Transitions:
+    def read(self, steps: Steps) -> EncoderInputs:
         """The steps in units of the data's standard deviations."""
         changes = steps.next_observations - steps.observations
         inputs = torch.cat([steps.observations, steps.actions, steps.rewards.unsqueeze(-1), changes], dim=-1)
-        return Transitions(self.scaling(inputs), steps.mask, self.state_action)
+        return EncoderInputs(self.scaling(inputs), steps.mask, self.state_action)
 
-    def forward(self, *groups: Transitions) -> tuple[Float[Tensor, "..."], ...]:
+    def forward(self, *groups: EncoderInputs) -> tuple[Float[Tensor, "..."], ...]:
         """Representations of each group, (tasks, trajectories, steps, latent), by one pass over them all."""
         rows = torch.cat([each.inputs.flatten(0, 2) for each in groups])
         parts = torch.tanh(self.perceptron(rows)).split([each.mask.numel() for each in groups])

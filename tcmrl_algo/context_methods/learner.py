@@ -12,9 +12,10 @@ from torch import Tensor, nn
 
 from tcmrl_algo.actor_critic.actor_critic import ActorCritic
 from tcmrl_algo.methods.problem import Algorithm, Metrics, Problem, TrainedModules
+from tcmrl_algo.networks.attention import Attention
 from tcmrl_algo.networks.optimizer import Adam
-from tcmrl_algo.networks.perceptron import Attention, set_hidden_dtype
-from tcmrl_algo.training.config import TrainingSettings
+from tcmrl_algo.networks.perceptron import set_hidden_dtype
+from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, Controller, Steps, Trajectory, UniformController
 
 ACTOR_CRITIC_STREAM = 1
@@ -87,7 +88,14 @@ class ContextAlgorithm(Algorithm):
         ).to(problem.device)
         everything = nn.ModuleDict({"context": self.learner, "actor_critic": self.actor_critic})
         set_hidden_dtype(everything, getattr(torch, settings.run.precision))
-        self._adam = settings.optimizer.build(everything, decay_steps=problem.steps)
+        table = settings.optimizer
+        self._adam = Adam(
+            everything,
+            learning_rate=table.learning_rate,
+            final_share=table.final_share,
+            decay_steps=problem.steps,
+            gradient_norm=table.gradient_norm,
+        )
         own = {**self.learner.optimizers(), **self.actor_critic.optimizers()}
         self._trained = TrainedModules({"all": everything}, {"all": self._adam, **own})
 

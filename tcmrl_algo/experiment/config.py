@@ -11,7 +11,8 @@ from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_algo.training.config import Protocol, validated
+from tcmrl_algo.settings.run import Protocol
+from tcmrl_algo.training.config import validated
 from tcmrl_data import TrainingError
 
 Metric = Literal[

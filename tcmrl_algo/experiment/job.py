@@ -15,8 +15,9 @@ from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.adaptation.evaluate import Evaluation, evaluate_run
 from tcmrl_algo.experiment.results import CurvePoint, RunResult, result_file
+from tcmrl_algo.settings.run import Protocol
 from tcmrl_algo.training.checkpoint import digest, open_run
-from tcmrl_algo.training.config import Protocol, TrainingConfig
+from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_algo.training.records import read_record, write_record
 from tcmrl_algo.training.train import Progress, resume_run, train_run
 from tcmrl_data import CheckpointError, Dataset, open_dataset, serve

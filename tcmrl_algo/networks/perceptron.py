@@ -1,4 +1,4 @@
-"""Networks: context encoder, task characteristic extractor, reward estimators, critics.
+"""Perceptrons, ensembles of them, and the standardisation of their inputs.
 
 Every network draws its start from a generator that is handed in; the global random state is never used.
 """
@@ -6,13 +6,11 @@ Every network draws its start from a generator that is handed in; the global ran
 import itertools
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import final
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor, nn
-from torch.nn import functional
 
 Activation = Callable[[Tensor], Tensor]
 SMALLEST_SCALE = 1e-5
@@ -119,106 +117,3 @@ class Standardizer(nn.Module):
 
     def forward(self, values: Float[Tensor, "*rows dim"]) -> Float[Tensor, "*rows dim"]:
         return ((values - self.mean) / self.scale).clamp(-LARGEST_INPUT, LARGEST_INPUT)
-
-
-def mean_representation(
-    representations: Float[Tensor, "lanes steps latent"], mask: Bool[Tensor, "lanes steps"]
-) -> Float[Tensor, "lanes latent"]:
-    """Eq. 2: c_mean = mean(c_1, ..., c_T) over each lane's real steps; FOCAL's context."""
-    real = mask.unsqueeze(-1)
-    return torch.where(real, representations, 0.0).sum(dim=1) / real.sum(dim=1)
-
-
-@dataclass(frozen=True)
-class Attention:
-    """What the extractor makes of the transitions of each lane.
-
-    Attributes:
-        representations: (lanes, steps, latent), c_t.
-        scores: (lanes, steps), Eq. 3.
-        weights: (lanes, steps), Eq. 4; 0 on padding, sums to 1.
-        context: (lanes, latent), Eq. 5.
-        mask: (lanes, steps) bool, real transitions.
-    """
-
-    representations: Float[Tensor, "lanes steps latent"]
-    scores: Float[Tensor, "lanes steps"]
-    weights: Float[Tensor, "lanes steps"]
-    context: Float[Tensor, "lanes latent"]
-    mask: Bool[Tensor, "lanes steps"]
-
-
-@final
-class TaskExtractor(nn.Module):
-    """The task characteristic extractor, Eq. 2-5: scores transitions against their mean and aggregates them.
-
-    Args:
-        latent: size of a representation.
-        hidden: widths of q's sigmoid layers (paper, F.2: 256); empty makes q linear, as in the code.
-        generator: draws the start.
-    """
-
-    def __init__(self, latent: int, *, hidden: Sequence[int], generator: torch.Generator) -> None:
-        super().__init__()
-        self.perceptron = Perceptron((2 * latent, *hidden, 1), generator=generator, activation=torch.sigmoid_)
-
-    def forward(
-        self, representations: Float[Tensor, "lanes steps latent"], mask: Bool[Tensor, "lanes steps"]
-    ) -> Attention:
-        """Attention over each lane's real transitions, of which there must be at least one.
-
-        c_mean = mean(c_1, ..., c_T); score_t = q(c_t, c_mean); w = softmax(score); c = sum_t w_t c_t.
-        """
-        mean = mean_representation(representations, mask).unsqueeze(1)
-        inputs = torch.cat([representations, mean.expand_as(representations)], dim=-1)
-        scores = self.perceptron(inputs).squeeze(-1)
-        weights = torch.softmax(torch.where(mask, scores, -torch.inf), dim=-1)
-        context = torch.einsum("lt,ltd->ld", weights, torch.where(mask.unsqueeze(-1), representations, 0.0))
-        return Attention(representations, scores, weights, context, mask)
-
-
-def uniform_attention(
-    representations: Float[Tensor, "lanes steps latent"], mask: Bool[Tensor, "lanes steps"]
-) -> Attention:
-    """What remains of Eq. 2-5 without an extractor: equal weights, and with them the mean of Eq. 2."""
-    weights = mask / mask.sum(dim=1, keepdim=True)
-    context = mean_representation(representations, mask)
-    return Attention(representations, torch.zeros_like(weights), weights, context, mask)
-
-
-@final
-class RewardEstimator(nn.Module):
-    """r_hat(s, a, c), the reward of a transition, or r_hat(s_1, a_1, ..., c), the return of a trajectory.
-
-    Args:
-        inputs: width of what is estimated on: a transition's state and action (Eq. 7 and 8), or those of a
-            whole trajectory `side_by_side` (Eq. 17 and 18).
-        latent: size of the context.
-        hidden: widths of the layers.
-        generator: draws the start.
-    """
-
-    def __init__(
-        self, inputs: int, *, latent: int, hidden: Sequence[int], generator: torch.Generator
-    ) -> None:
-        super().__init__()
-        self.perceptron = Perceptron((inputs + latent, *hidden, 1), generator=generator)
-
-    def forward(
-        self, inputs: Float[Tensor, "tasks rows inputs"], context: Float[Tensor, "tasks latent"]
-    ) -> Float[Tensor, "tasks rows"]:
-        """One estimate per row, under its task's context."""
-        spread = context.unsqueeze(1).expand(-1, inputs.shape[1], -1)
-        values: Tensor = self.perceptron(torch.cat([inputs, spread], dim=-1))
-        return values.squeeze(-1)
-
-
-def side_by_side(
-    steps: Float[Tensor, "tasks trajectories steps inputs"],
-    mask: Bool[Tensor, "tasks trajectories steps"],
-    *,
-    horizon: int,
-) -> Float[Tensor, "tasks trajectories all_inputs"]:
-    """The steps of a trajectory as one vector; steps that an episode does not have are zeros."""
-    real = torch.where(mask.unsqueeze(-1), steps, 0.0)
-    return functional.pad(real, (0, 0, 0, horizon - steps.shape[2])).flatten(2)

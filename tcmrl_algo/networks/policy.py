@@ -14,7 +14,7 @@ from tcmrl_algo.networks.perceptron import Perceptron
 
 
 @dataclass(frozen=True)
-class PolicySample:
+class PolicyActions:
     """Actions drawn from the policy.
 
     Attributes:
@@ -31,7 +31,7 @@ class PolicySample:
 
 
 @final
-class GaussianPolicy(nn.Module):
+class PolicyNetwork(nn.Module):
     """A Gaussian with diagonal covariance, squashed by tanh.
 
     Log standard deviations are held in [log_std_min, log_std_max] by softplus from either side, which is
@@ -62,7 +62,7 @@ class GaussianPolicy(nn.Module):
 
     def sample(
         self, inputs: Float[Tensor, "rows inputs"], noise: Float[Tensor, "rows action"]
-    ) -> PolicySample:
+    ) -> PolicyActions:
         """Reparameterised actions from standard normal noise.
 
         log pi(a) = sum over dimensions of log N(u) - log(1 - tanh(u)^2), the latter as
@@ -72,4 +72,4 @@ class GaussianPolicy(nn.Module):
         free = mean + log_std.exp() * noise
         normal = -0.5 * noise.square() - log_std - 0.5 * math.log(2 * math.pi)
         squash = 2.0 * (math.log(2.0) - free - functional.softplus(-2.0 * free))
-        return PolicySample(torch.tanh(free), (normal - squash).sum(dim=-1), mean, log_std)
+        return PolicyActions(torch.tanh(free), (normal - squash).sum(dim=-1), mean, log_std)

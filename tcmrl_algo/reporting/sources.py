@@ -9,8 +9,8 @@ from typing import get_args
 from tcmrl_algo.adaptation.evaluate import evaluate_run
 from tcmrl_algo.experiment.config import Experiment, read_experiment, run_id
 from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file
+from tcmrl_algo.settings.run import Protocol
 from tcmrl_algo.training.checkpoint import Run, digest, open_run
-from tcmrl_algo.training.config import Protocol
 from tcmrl_data import CheckpointError, TrainingError, canonical_json, parse_json
 
 

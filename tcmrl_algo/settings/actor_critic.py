@@ -1,0 +1,39 @@
+"""The `[training.actor_critic]` table."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from tcmrl_algo.settings.brac import BracSettings
+
+
+class ActorCriticSettings(BaseModel):
+    """The `[training.actor_critic]` table.
+
+    Attributes:
+        hidden: widths of all networks here (published code: 256 x 3).
+        gamma: discount factor (paper, F.2: 0.99; published code: 0.9 for the point robots).
+        reward_scale: multiplies rewards (published code: 5; 100 for the point robots).
+        entropy: alpha in front of log pi (published code: 1, beside rewards scaled by 5 or 100).
+        tau: step of V's target towards V (published code: 0.005).
+        mean_regularization: weight of the squared policy means (published code: 1e-3).
+        std_regularization: weight of the squared policy log standard deviations (published code: 1e-3).
+        log_std_range: bounds of the policy's log standard deviation (published code: [-20, 0]).
+        clip_targets: hold V(s') within what the data's rewards allow (ours: critics trained on narrow data
+            believe in states outside it).
+        divergence_factor: training stops where some |Q| exceeds what the data's rewards allow this many times
+            (ours; Q that diverges grows without end, so that the number hardly matters).
+        brac: behavior regularisation.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    hidden: tuple[int, ...] = (256, 256, 256)
+    gamma: float = Field(default=0.99, ge=0, lt=1)
+    reward_scale: float = Field(default=5.0, gt=0)
+    entropy: float = Field(default=1.0, ge=0)
+    tau: float = Field(default=0.005, gt=0, le=1)
+    mean_regularization: float = Field(default=1e-3, ge=0)
+    std_regularization: float = Field(default=1e-3, ge=0)
+    log_std_range: tuple[float, float] = (-20.0, 0.0)
+    clip_targets: bool = True
+    divergence_factor: float = Field(default=100.0, gt=1)
+    brac: BracSettings = BracSettings()

@@ -1,0 +1,46 @@
+"""The `[training.run]` table."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Protocol = Literal["paper", "offline", "idaq"]
+
+
+class RunSettings(BaseModel):
+    """The `[training.run]` table.
+
+    Attributes:
+        algorithm: a file of `tcmrl_algo/algorithms`.
+        steps: training steps, and the length of all schedules.
+        snapshots: which snapshots to learn from: `all`, `last`, `steps>=N` or `return>=Q`.
+        context_snapshots: which snapshots context and execution trajectories and windows come from, and
+            stored contexts in evaluation; those of `snapshots` if left out. The actor-critic's
+            transitions are always those of `snapshots`.
+        threads: CPU threads of torch; results depend on it in their last bits.
+        precision: in which hidden layers multiply; all else is float32. `bfloat16` is faster where the
+            processor multiplies it in hardware, and changes results.
+        log_every: steps between two lines of metrics.
+        checkpoint_every: steps between two checkpoints.
+        protocol: how to adapt to test tasks (paper, section 4.2: `paper`).
+        episodes: adaptation episodes per test task.
+        random_episodes: how many of them act uniformly, under `paper`.
+        offline_trajectories: stored trajectories that make one context, under `offline`.
+        final_episodes: episodes of the adapted policy that its final return averages over.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    algorithm: str = "tcmrl"
+    steps: int = Field(default=100_000, ge=1)
+    snapshots: str = "all"
+    context_snapshots: str | None = None
+    threads: int = Field(default=1, ge=1)
+    precision: Literal["float32", "bfloat16"] = "float32"
+    log_every: int = Field(default=100, ge=1)
+    checkpoint_every: int = Field(default=5_000, ge=1)
+    protocol: Protocol = "paper"
+    episodes: int = Field(default=10, ge=1)
+    random_episodes: int = Field(default=2, ge=1)
+    offline_trajectories: int = Field(default=4, ge=1)
+    final_episodes: int = Field(default=1, ge=1)
