@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from tcmrl_data.engine.base import Unit
     from tcmrl_data.engine.worker import serve
     from tcmrl_data.envs.base import (
-        Controller,
         Environment,
         Lanes,
-        UniformController,
         environment_types,
         make_environment,
     )
+    from tcmrl_data.envs.controller import Controller, Transition, UniformController
+    from tcmrl_data.envs.recorder import Recorder
     from tcmrl_data.envs.rollout import roll_out
     from tcmrl_data.envs.trajectory import Trajectory
     from tcmrl_data.foundation.canonical import canonical_json, parse_json
@@ -66,13 +66,13 @@ _HOMES = {
     "engine.base": ("Unit",),
     "engine.worker": ("serve",),
     "envs.base": (
-        "Controller",
         "Environment",
         "Lanes",
-        "UniformController",
         "environment_types",
         "make_environment",
     ),
+    "envs.controller": ("Controller", "Transition", "UniformController"),
+    "envs.recorder": ("Recorder",),
     "foundation.errors": ("CheckpointError", "SelectionError", "TcmrlError", "TrainingError"),
     "build.events": ("BuildEvent", "BuildStatus", "build_status"),
     "dataset.listing": ("list_datasets",),
@@ -133,6 +133,7 @@ __all__ = [
     "Prefetch",
     "Purpose",
     "Recipe",
+    "Recorder",
     "RepairReport",
     "Replay",
     "Sampler",
@@ -143,6 +144,7 @@ __all__ = [
     "TcmrlError",
     "TrainingError",
     "Trajectory",
+    "Transition",
     "UniformController",
     "Unit",
     "VerifyLevel",

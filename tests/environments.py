@@ -8,11 +8,8 @@ import gymnasium
 import numpy as np
 
 from tcmrl_data import load_recipe
-from tcmrl_data.envs.base import (
-    Controller,
-    Environment,
-    Parameters,
-)
+from tcmrl_data.envs.base import Environment, Parameters
+from tcmrl_data.envs.controller import Controller
 from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.trajectory import Trajectory
 

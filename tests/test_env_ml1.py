@@ -6,10 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tcmrl_data.envs.base import (
-    UniformController,
-    environment_types,
-)
+from tcmrl_data.envs.base import environment_types
+from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.foundation.errors import TaskError
 from tests.environments import ML1_IN_FULL, actions_of, environment_of, episodes, parameters_of
 

@@ -5,9 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tcmrl_data.envs.base import (
-    UniformController,
-)
+from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.foundation.errors import TaskError
 from tests.environments import actions_of, environment_of, episodes, parameters_of
 

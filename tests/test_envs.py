@@ -9,10 +9,8 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tcmrl_data.envs.base import (
-    UniformController,
-    environment_types,
-)
+from tcmrl_data.envs.base import environment_types
+from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.recipe.tasks import draw_tasks
 from tests.environments import ML1_IN_FULL, actions_of, environment_of, episodes, parameters_of, play
 

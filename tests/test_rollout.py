@@ -1,11 +1,23 @@
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from tcmrl_data import Controller, Lanes, UniformController, load_recipe, roll_out
+from tcmrl_data import (
+    Controller,
+    Lanes,
+    Recorder,
+    Trajectory,
+    Transition,
+    UniformController,
+    load_recipe,
+    roll_out,
+)
 from tcmrl_data.envs.base import Environment, EnvironmentLanes, LaneStep
+from tcmrl_data.envs.controller import View
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
+from tests.environments import environment_of, parameters_of
 
 
 def roll(environment: Environment, lanes: Lanes, controller: Controller, seed: int = 0) -> list:
@@ -41,19 +53,18 @@ class Falling(Lanes):
 
 
 class Recording(Controller):
-    """Asks for an action out of bounds and remembers how many lanes it saw, and what each step paid."""
+    """Asks for an action out of bounds; remembers how many lanes it saw, and every step."""
 
     def __init__(self) -> None:
         self.seen: list[int] = []
-        self.paid: list[float] = []
+        self.transitions: list[Transition] = []
 
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         self.seen.append(len(observations))
         return np.full((len(observations), 2), 3.0)
 
-    def observe(self, rewards: FloatArray, active: BoolArray) -> None:
-        assert rewards[~active].sum() == 0
-        self.paid.append(float(rewards.sum()))
+    def observe(self, transition: Transition) -> None:
+        self.transitions.append(transition)
 
 
 @pytest.fixture
@@ -66,7 +77,6 @@ def test_episodes_end_where_they_end(environment: Environment) -> None:
     episodes = roll(environment, lanes, controller)
     assert [len(each) for each in episodes] == [1, 2, 3, 4, 4, 4]
     assert [bool(each.terminated[-1]) for each in episodes] == [True] * 4 + [False] * 2
-    assert controller.paid == [6.0, 5.0, 4.0, 3.0]  # a controller may adapt within an episode
     assert [bool(each.truncated[-1]) for each in episodes] == [False] * 4 + [True] * 2
     assert [each.observations[-1, 0] for each in episodes] == [1, 2, 3, 4, 4, 4]
     assert [each.undiscounted_return for each in episodes] == [1, 2, 3, 4, 4, 4]
@@ -78,6 +88,74 @@ def test_the_controller_sees_every_lane_and_actions_are_stored_as_executed(envir
     episodes = roll(environment, Falling(), controller)
     assert controller.seen == [6, 6, 6, 6]
     assert all((each.actions == 1.0).all() for each in episodes)
+
+
+def test_the_controller_observes_every_step_as_it_was_executed(environment: Environment) -> None:
+    controller = Recording()
+    roll(environment, Falling(), controller)
+    assert [step.rewards.sum() for step in controller.transitions] == [6.0, 5.0, 4.0, 3.0]
+    assert [step.active.sum() for step in controller.transitions] == [6, 5, 4, 3]
+    assert all((step.actions == 1.0).all() for step in controller.transitions)  # clipped from 3.0
+    for t, step in enumerate(controller.transitions):
+        assert (step.observations == t).all() and (step.next_observations == t + 1).all()
+        assert step.terminated.sum() == 1 and not step.rewards[~step.active].any()
+
+
+class Reconstructing(Controller):
+    """Draws actions from its noise, and records all that it is told."""
+
+    def __init__(self, view: View) -> None:
+        self.view = view
+        self.recorder = Recorder()
+        self.lengths: list[list[int]] = []
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        self.lengths.append([len(trajectory) for trajectory in self.recorder.trajectories()])
+        return 2 * noise
+
+    def observe(self, transition: Transition) -> None:
+        self.recorder.record(transition)
+
+
+def assert_rebuilt(controller: Reconstructing, stored: list[Trajectory], environment: Environment) -> None:
+    rebuilt = controller.recorder.trajectories()
+    assert len(rebuilt) == len(stored)
+    for found, expected in zip(rebuilt, stored, strict=True):
+        if controller.view == "full":
+            found = replace(found, observations=environment.stored_view(found.observations))
+        for name in ("observations", "actions", "rewards", "terminated", "truncated"):
+            ours, theirs = getattr(found, name), getattr(expected, name)
+            assert ours.dtype == theirs.dtype
+            assert np.array_equal(ours, theirs), name
+
+
+def test_a_controller_rebuilds_the_stored_trajectories_of_lanes_that_end_early(
+    environment: Environment,
+) -> None:
+    controller = Reconstructing("stored")
+    stored = roll(environment, Falling(), controller)
+    assert [len(trajectory) for trajectory in stored] == [1, 2, 3, 4, 4, 4]
+    assert_rebuilt(controller, stored, environment)
+    assert controller.lengths == [[], [1] * 6, [1, *[2] * 5], [1, 2, *[3] * 4]]  # within the episode
+
+
+@pytest.mark.parametrize("view", ["stored", "full"])
+def test_a_controller_rebuilds_the_stored_trajectories_in_either_view(view: View) -> None:
+    environment = environment_of("ml1/reach", "environment.horizon=4")
+    controller = Reconstructing(view)
+    stored = roll(environment, environment.lanes(parameters_of("ml1/reach")[:2]), controller)
+    assert_rebuilt(controller, stored, environment)
+    goals = [trajectory.observations[:, -3:] for trajectory in controller.recorder.trajectories()]
+    assert all(np.any(goal != 0) == (view == "full") for goal in goals)
+
+
+def test_recorded_steps_are_copies() -> None:
+    recorder, array, active = Recorder(), np.ones((1, 2), np.float32), np.ones(1, dtype=bool)
+    recorder.record(Transition(array, array, array[:, 0], array, ~active, ~active, active))
+    array[:] = 7.0
+    (trajectory,) = recorder.trajectories()
+    assert (trajectory.observations == 1.0).all() and (trajectory.actions == 1.0).all()
+    assert (trajectory.rewards == 1.0).all()
 
 
 def test_episodes_do_not_depend_on_their_neighbours(environment: Environment) -> None:

@@ -7,7 +7,8 @@ from typing import Any
 
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.envs.base import Environment, Reward, View
+from tcmrl_data.envs.base import Environment, Reward
+from tcmrl_data.envs.controller import View
 from tcmrl_data.recipe.tasks import Task
 
 

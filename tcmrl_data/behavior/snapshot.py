@@ -10,7 +10,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
-from tcmrl_data.envs.base import Controller, Environment, Parameters, View
+from tcmrl_data.envs.base import Environment, Parameters
+from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json, sha256
 from tcmrl_data.foundation.disk import make_folders, write_tree

@@ -8,7 +8,8 @@ import numpy as np
 
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.build.provenance import provenance
-from tcmrl_data.envs.base import Controller, Environment, Lanes, UniformController
+from tcmrl_data.envs.base import Environment, Lanes
+from tcmrl_data.envs.controller import Controller, UniformController
 from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import canonical_json, digest, sha256

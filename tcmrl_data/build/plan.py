@@ -12,7 +12,8 @@ from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.build.part import part_bytes
 from tcmrl_data.build.unit import behavior_source, unit_memory
-from tcmrl_data.envs.base import Environment, UniformController
+from tcmrl_data.envs.base import Environment
+from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.recipe.recipe import Recipe

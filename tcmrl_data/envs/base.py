@@ -11,14 +11,12 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 from tcmrl_data.foundation.plugins import modules, unknown_name
 
 Parameters = Mapping[str, Any]
 """JSON values that define one task."""
-
-View = Literal["stored", "full"]
-"""`stored`: what the dataset holds and the meta-learner sees. `full`: with what the task hides too."""
 
 Reward = Literal["stored", "dense"]
 """`stored`: what the dataset holds. `dense`: shaped, where the stored reward is sparse."""
@@ -50,38 +48,6 @@ class EnvironmentSettings(BaseModel):
         if self.train >= self.tasks:
             raise ValueError(f"train ({self.train}) must be smaller than tasks ({self.tasks})")
         return self
-
-
-class Controller(abc.ABC):
-    """Acts for a batch of lanes; rollouts use this face of every policy."""
-
-    view: View = "stored"
-    """Which observations the controller is given."""
-
-    def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
-        """Noise of one episode, (num_steps, action_dim) float32; standard normal unless overridden."""
-        return generator.standard_normal((num_steps, action_dim), dtype=np.float32)
-
-    @abc.abstractmethod
-    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
-        """Actions (lanes, action_dim) for observations (lanes, observation_dim) and this step's noise."""
-
-    def observe(self, rewards: FloatArray, active: BoolArray) -> None:
-        """Told after every step what it paid, (lanes,), and which lanes took it; does nothing by itself.
-
-        For controllers that adapt within an episode; the state after the step comes with the next `act`.
-        """
-
-
-@final
-class UniformController(Controller):
-    """Uniform actions in [-1, 1]."""
-
-    def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
-        return generator.uniform(-1.0, 1.0, (num_steps, action_dim)).astype(np.float32)
-
-    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
-        return noise
 
 
 @dataclass(frozen=True)

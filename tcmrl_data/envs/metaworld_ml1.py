@@ -17,7 +17,8 @@ import numpy as np
 from pydantic import Field
 
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint
-from tcmrl_data.envs.base import Controller, Environment, EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
+from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import TaskError
 

@@ -11,16 +11,8 @@ import gymnasium
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.envs.base import (
-    Controller,
-    Environment,
-    EnvironmentSettings,
-    Lanes,
-    LaneStep,
-    Parameters,
-    Reward,
-    View,
-)
+from tcmrl_data.envs.base import Environment, EnvironmentSettings, Lanes, LaneStep, Parameters, Reward
+from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 
 STEP_SIZE = 0.1

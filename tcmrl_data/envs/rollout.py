@@ -1,10 +1,13 @@
 """The only environment loop: builds roll out behavior policies with it, evaluation rolls out learned ones."""
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
 
-from tcmrl_data.envs.base import Controller, Environment, Lanes
+from tcmrl_data.envs.base import Environment, Lanes
+from tcmrl_data.envs.controller import Controller, Transition
+from tcmrl_data.envs.recorder import Recorder
 from tcmrl_data.envs.trajectory import Trajectory
 
 
@@ -25,7 +28,7 @@ def roll_out(
     Args:
         environment: names the horizon, the action size and what is hidden from storage.
         lanes: L episodes; may be reused from batch to batch.
-        controller: acts for all L lanes.
+        controller: acts for all L lanes, and observes every step.
         reset_seeds: L seeds, one per episode.
         noise: L generators, one per episode; each yields its episode's noise at once.
 
@@ -33,41 +36,28 @@ def roll_out(
         L trajectories in lane order; float32 observations, actions and rewards.
     """
     horizon, action_dim = environment.settings.horizon, environment.action_dim
-    draws = np.stack([controller.draw_noise(each, horizon, action_dim) for each in noise])
-    num_lanes = lanes.num_lanes
-    observations = np.zeros((num_lanes, horizon + 1, environment.observation_dim), np.float32)
-    actions = np.zeros((num_lanes, horizon, action_dim), np.float32)
-    rewards = np.zeros((num_lanes, horizon), np.float32)
-    terminated, truncated = np.zeros((2, num_lanes, horizon), dtype=bool)
-    extras = {name: np.zeros((num_lanes, horizon), dtype) for name, dtype in environment.extras.items()}
-    lengths = np.zeros(num_lanes, dtype=np.int64)
-    active = np.ones(num_lanes, dtype=bool)
-
+    draws = np.stack([controller.draw_noise(generator, horizon, action_dim) for generator in noise])
+    recorder = Recorder()
+    active = np.ones(lanes.num_lanes, dtype=bool)
     full = lanes.reset(reset_seeds)
     stored = environment.stored_view(full)
-    observations[:, 0] = stored
     for t in range(horizon):
         seen = full if controller.view == "full" else stored
-        chosen = np.clip(controller.act(seen, draws[:, t]), -1.0, 1.0).astype(np.float32)
-        step = lanes.step(chosen, active)
-        controller.observe(step.rewards, active)
-        full, stored = step.observations, environment.stored_view(step.observations)
-        actions[:, t], rewards[:, t], observations[:, t + 1] = chosen, step.rewards, stored
-        terminated[:, t], truncated[:, t] = step.terminated, step.truncated
-        for name, array in extras.items():
-            array[:, t] = step.extras[name]
-        lengths += active
+        actions = np.clip(controller.act(seen, draws[:, t]), -1.0, 1.0).astype(np.float32)
+        step = lanes.step(actions, active)
+        next_stored = environment.stored_view(step.observations)
+        transition = Transition(
+            stored, actions, step.rewards, next_stored, step.terminated, step.truncated, active
+        )
+        extras = {name: step.extras[name].astype(kind) for name, kind in environment.extras.items()}
+        recorder.record(transition, extras)
+        if controller.view == "full":
+            transition = dataclasses.replace(
+                transition, observations=full, next_observations=step.observations
+            )
+        controller.observe(transition)
+        full, stored = step.observations, next_stored
         active = active & ~(step.terminated | step.truncated)
         if not active.any():
             break
-    return [
-        Trajectory(
-            observations[lane, : length + 1],
-            actions[lane, :length],
-            rewards[lane, :length],
-            terminated[lane, :length],
-            truncated[lane, :length],
-            {name: array[lane, :length] for name, array in extras.items()},
-        )
-        for lane, length in enumerate(lengths)
-    ]
+    return recorder.trajectories()
