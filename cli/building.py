@@ -104,7 +104,7 @@ def plan(
         print_json(dataclasses.asdict(planned))
         return
     title = f"Plan: {planned.environment}, profile {planned.profile}"
-    table = make_table(title, columns=["what", "how much"], text=["what", "how much"])
+    table = make_table(title, columns=["what", "how much"], text=["what"], long_text=["how much"])
     rows = {
         "behavior": planned.behavior,
         "tasks": f"{planned.tasks:,} ({planned.train:,} train, {planned.test:,} test)",

@@ -57,7 +57,7 @@ def envs(as_json: bool, quiet: bool) -> None:
         return
     heads = {
         "name": "environment",
-        "observation_dim": "observation",
+        "observation_dim": "observed",
         "action_dim": "action",
         "horizon": "horizon",
         "tasks": "tasks",
@@ -92,16 +92,20 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
     if not rows:
         remark(f"no datasets below {root}; build one with `tcmrl-data build ENV`", quiet=quiet)
         return
-    columns = ["dataset", "environment", "profile", "behavior", "seed", "tasks", "parts", "state", "root"]
-    words = ["environment", "profile", "behavior", "root"]
-    table = make_table(f"Datasets below {root}", columns=columns, text=words, long_text=["dataset", "state"])
+    table = make_table(
+        f"Datasets below {root}",
+        columns=["dataset", "built from", "tasks", "parts", "state", "root"],
+        text=["root"],
+        long_text=["dataset", "built from", "state"],
+    )
     for row in rows:
         if "error" in row:
-            table.add_row(row["path"], *[""] * 6, f"unreadable: {row['error']}", "")
+            table.add_row(row["path"], "", "", "", f"unreadable: {row['error']}", "")
             continue
+        built_from = f"{row['name']}, {row['profile']}, {row['behavior']}, seed {row['seed']}"
         state = "complete" if row["complete"] else "incomplete"
-        values = [row[key] for key in ("path", "name", "profile", "behavior", "seed", "tasks", "parts")]
-        table.add_row(*map(str, values), state, row["root"][:12])
+        counts = (f"{row['tasks']:,}", f"{row['parts']:,}")
+        table.add_row(row["path"], built_from, *counts, state, row["root"][:12])
     print_table(table)
 
 

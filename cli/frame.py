@@ -30,6 +30,9 @@ SPANS = ((86_400, "d", 3_600, "h"), (3_600, "h", 60, "min"), (60, "min", 1, "s")
 PIPE_WIDTH = 250
 """Columns of a table that does not go to a terminal."""
 
+FOLDED_WIDTH = 12
+"""Columns that a folded text keeps where the terminal is narrow."""
+
 
 def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
     """Runs a command line and returns its exit code; errors become one line on standard error.
@@ -103,10 +106,23 @@ def print_json(document: Any) -> None:
 
 
 def print_table(table: "Table") -> None:
-    """Prints a table on standard output: as wide as the terminal, or as wide as it needs in a pipe."""
+    """Prints a table on standard output: as wide as the terminal, or as wide as it needs in a pipe.
+
+    No number is cut: where the columns do not fit, lines are longer than the terminal is wide.
+    """
     from rich.console import Console
 
-    Console(width=None if sys.stdout.isatty() else PIPE_WIDTH, markup=False, emoji=False).print(table)
+    in_terminal = sys.stdout.isatty()
+    console = Console(width=None if in_terminal else PIPE_WIDTH, markup=False, emoji=False, highlight=False)
+    for column in table.columns:
+        if column.no_wrap:
+            texts = (str(column.header), *map(str, column.cells))
+            column.min_width = max(len(line) for text in texts for line in text.split("\n"))
+    width = max(console.width, console.measure(table).minimum)
+    with console.capture() as capture:
+        console.print(table, width=width, crop=False)
+    lines = capture.get().splitlines()
+    click.echo("\n".join(lines if in_terminal else map(str.rstrip, lines)))
 
 
 def make_table(
@@ -123,11 +139,18 @@ def make_table(
     from rich import box
     from rich.table import Table
 
-    table = Table(title=title, box=box.SIMPLE_HEAD, title_justify="left", title_style="bold")
+    table = Table(
+        title=title,
+        box=box.SIMPLE_HEAD,
+        title_justify="left",
+        title_style="bold",
+        collapse_padding=True,
+        pad_edge=False,
+    )
     words, sentences = set(text), set(long_text)
     for column in columns:
         if column in sentences:
-            table.add_column(column, overflow="fold", min_width=12)
+            table.add_column(column, overflow="fold", min_width=FOLDED_WIDTH)
         else:
             table.add_column(column, justify="left" if column in words else "right", no_wrap=True)
     return table

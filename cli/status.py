@@ -42,7 +42,7 @@ def status(dataset: Path, as_json: bool, quiet: bool) -> None:
         "time left": "unknown" if left is None else f"about {duration(left)}",
         "last word": "none" if updated is None else f"{duration(max(0.0, time.time() - updated))} ago",
     }
-    table = make_table(str(dataset), columns=["what", "now"], text=["what", "now"])
+    table = make_table(str(dataset), columns=["what", "now"], text=["what"], long_text=["now"])
     for name, value in rows.items():
         table.add_row(name, printable(value))
     for failure in found.failed:

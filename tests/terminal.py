@@ -9,7 +9,7 @@ import subprocess
 import sys
 import termios
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -44,14 +44,23 @@ def in_terminal(
         env: changes of the environment variables.
     """
     script = Path(sys.executable).with_name(program)
+    return _show([str(script), *map(str, arguments)], columns, env or {})
+
+
+def show_in_terminal(code: str, *, columns: int = 80) -> Shown:
+    """As `in_terminal`, for Python code."""
+    return _show(["-c", code], columns, {})
+
+
+def _show(arguments: Sequence[str], columns: int, env: Mapping[str, str]) -> Shown:
     inherited = {name: value for name, value in os.environ.items() if name not in ("COLUMNS", "LINES")}
     output, errors = _Terminal(columns), _Terminal(columns)
     finished = subprocess.run(
-        [sys.executable, str(script), *map(str, arguments)],
+        [sys.executable, *arguments],
         stdin=output.device,
         stdout=output.device,
         stderr=errors.device,
-        env=inherited | {"TERM": "xterm"} | dict(env or {}),
+        env=inherited | {"TERM": "xterm"} | dict(env),
         check=False,
     )
     return Shown(finished.returncode, output.close(), errors.close())

@@ -1,17 +1,16 @@
 """Progress on standard error, and how durations and sizes are written."""
 
 import json
-import os
-import pty
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from tcmrl_cli.frame import duration, size
-from tcmrl_cli.progress import StageProgress
+from tcmrl_cli.progress import Pace, StageProgress
 
 from tests.conftest import TINY
+from tests.terminal import assert_fits, show_in_terminal
 
 BUILD = ("build", "point-robot", "--profile", "quick")
 MAIN = "from tcmrl_cli.data import main; main()"
@@ -38,28 +37,66 @@ def test_plain_progress_goes_to_standard_error(tmp_path: Path) -> None:
     )
     assert json.loads(result.stdout)["built"] == 3
     lines = result.stderr.strip().splitlines()
-    assert lines[-1].startswith("published parts: 3 of 3 parts, ")
+    assert lines[-1].startswith("published parts: 3 of 3 parts")
     assert not any("\x1b" in line for line in lines)
 
 
-def test_a_terminal_gets_bars() -> None:
+BARS = """
+import time
+from tcmrl_cli import progress
+progress.KNOWN_SECONDS = 0.01
+with progress.StageProgress() as stages:
+    for done in range(0, 100_000_001, 10_000_000):
+        stages.update("behavior training", done=done, total=100_000_000, unit="steps")
+        stages.update("published parts", done=done / 100_000, total=1_000, unit="parts")
+        time.sleep(0.02)
+    stages.note("all of it")
+"""
+
+
+def test_bars_in_a_terminal_take_one_line_each_and_cut_no_number() -> None:
+    shown = show_in_terminal(BARS)
+    assert shown.code == 0
+    assert_fits(shown.errors.replace("\r", "\n"))
+    assert "100,000,000/100,000,000 steps" in shown.errors
+    assert "1,000/1,000 parts" in shown.errors
+    assert "all of it" in shown.errors
+    assert "━" in shown.errors
+    wrapped = [line for line in shown.errors.replace("\r", "\n").splitlines() if line and line[0] == " "]
+    assert wrapped == []
+
+
+def test_a_detail_is_left_out_where_it_does_not_fit() -> None:
     code = (
         "from tcmrl_cli.progress import StageProgress\n"
         "with StageProgress() as progress:\n"
-        "    progress.update('training', done=5, total=10, unit='steps')\n"
-        "    progress.note('half of it')\n"
-        "    progress.update('training', done=10, total=10, unit='steps')\n"
+        "    progress.update('training', done=5, total=10, unit='steps', detail='45% waiting for data')\n"
     )
-    driver, terminal = pty.openpty()
-    environment = os.environ | {"TERM": "xterm", "COLUMNS": "100"}
-    subprocess.run([sys.executable, "-c", code], stderr=terminal, check=True, env=environment)
-    os.close(terminal)
-    shown = os.read(driver, 65536).decode()
-    os.close(driver)
-    assert "training" in shown
-    assert "10/10 steps" in shown
-    assert "half of it" in shown
-    assert "━" in shown
+    assert "45% waiting for data" in show_in_terminal(code).errors
+    narrow = show_in_terminal(code, columns=40).errors
+    assert "5/10 steps" in narrow
+    assert "waiting" not in narrow
+
+
+def test_time_left_is_said_only_once_the_pace_is_known(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([20.0, 20.5, 22.0, 24.0, 30.0])
+    monkeypatch.setattr("tcmrl_cli.progress.time.monotonic", lambda: next(clock))
+    pace = Pace(0)
+    found = []
+    for done in (0, 1, 2, 4, 5, 11):
+        pace.update(done)
+        found.append(pace.seconds_left(101))
+    assert found == [None, None, None, None, None, 90.0]  # one a second since the first, at 20 s
+    assert pace.rate == 1.0
+
+
+def test_a_long_stage_says_its_time_left_after_a_minute(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([1.0, 60.0, 61.0])
+    monkeypatch.setattr("tcmrl_cli.progress.time.monotonic", lambda: next(clock))
+    pace = Pace(0)
+    for done, expected in ((1, None), (60, None), (61, 9939.0)):
+        pace.update(done)
+        assert pace.seconds_left(10_000) == expected
 
 
 def test_quiet_progress_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,0 +1,73 @@
+"""Tables in a terminal of 80 columns and in a pipe: every number whole, every line as wide as it may be."""
+
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+from tcmrl_cli.data import data
+
+from tcmrl_data import Dataset
+from tests.commands import Call, in_process
+from tests.terminal import assert_fits, in_terminal
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Call:
+    return in_process(data, capsys)
+
+
+@pytest.fixture(scope="module")
+def shelf(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder of datasets with a long name, one of them damaged."""
+    folder = tmp_path_factory.mktemp("a-folder-of-datasets-whose-name-is-long")
+    shutil.copytree(tiny_folder, folder / "point-robot-with-a-long-name")
+    damaged = folder / "damaged"
+    shutil.copytree(tiny_folder, damaged)
+    (damaged / "manifest.json").write_text("{")
+    return folder
+
+
+def test_the_list_of_datasets_fits_a_terminal_with_root_and_state_whole(shelf: Path, tiny: Dataset) -> None:
+    shown = in_terminal("tcmrl-data", "list", shelf)
+    assert_fits(shown.output)
+    assert tiny.manifest.root[:12] in shown.output
+    assert "complete" in shown.output
+    assert "unreadable" in "".join(shown.output.split())
+    lines = shown.output.splitlines()
+    width = next(line.index("built from") for line in lines if "built from" in line)
+    assert "point-robot-with-a-long-name" in "".join(line[:width].strip() for line in lines)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("envs",),
+        ("plan", "half-cheetah-vel", "--profile", "quick"),
+        ("inspect", "returns", "DATASET"),
+        ("inspect", "tasks", "DATASET"),
+        ("inspect", "snapshots", "DATASET"),
+        ("inspect", "episodes", "DATASET", "--task", "40"),
+        ("status", "DATASET"),
+        ("verify", "DATASET"),
+        ("gc", "DATASET"),
+        ("cache", "list"),
+    ],
+    ids=" ".join,
+)
+def test_every_table_fits_a_terminal_and_says_what_it_says_in_a_pipe(
+    command: tuple[str, ...], tiny_folder: Path, call: Call
+) -> None:
+    arguments = [str(tiny_folder) if word == "DATASET" else word for word in command]
+    shown = in_terminal("tcmrl-data", *arguments)
+    assert shown.code == 0
+    if command[0] not in ("verify", "gc"):  # their one line holds the dataset's path
+        assert_fits(shown.output)
+    piped = call(*arguments)[1]
+    assert all(line == line.rstrip() for line in piped.splitlines())
+    if command[0] in ("envs", "inspect"):
+        assert sorted(numbers(shown.output)) == sorted(numbers(piped))
+
+
+def numbers(text: str) -> list[str]:
+    return re.findall(r"-?[\d,]*\d(?:\.\d+)?", text)
