@@ -10,10 +10,11 @@ from tcmrl_data.build.driver import Driver, make_groups
 from tcmrl_data.build.part import seal_part
 from tcmrl_data.build.provenance import provenance
 from tcmrl_data.envs.base import Environment
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.disk import publish_folder
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import Task, choose_tasks
+from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import References, part_folder
 
 STEPS = 10_000

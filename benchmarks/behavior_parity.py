@@ -28,7 +28,8 @@ from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.build.part import roll_out_part
 from tcmrl_data.build.unit import behavior_source
-from tcmrl_data.recipe.tasks import Task, choose_tasks
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.recipe.tasks import choose_tasks
 
 CHECKPOINTS = 5
 RESAMPLES = 10_000

@@ -97,7 +97,7 @@ def plan(
 
     recipe = _load(environment, profile, behavior, overrides)
     chosen = _parse_tasks(recipe, tasks)
-    tcmrl_data.plugin("tcmrl_data.engine", "engine", engine)
+    tcmrl_data.ENGINES.get(engine)
     remark("measuring this machine for a few seconds …", quiet=quiet or as_json)
     planned = tcmrl_data.plan_build(recipe, tasks=chosen, workers=workers)
     if as_json:

@@ -142,7 +142,7 @@ def export(
     """
     import tcmrl_data
 
-    exporter = tcmrl_data.plugin("tcmrl_data.interchange.formats", "format", format_name)
+    exporter = tcmrl_data.FORMATS.get(format_name)()
     opened = tcmrl_data.open_dataset(dataset)
     folder = opened.folder if opened.folder.name not in ("", "..") else opened.folder.resolve()
     target = out or folder.with_name(f"{folder.name}-{format_name}")

@@ -8,6 +8,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from tcmrl_data.behavior.base import BEHAVIOR_SOURCES
     from tcmrl_data.behavior.snapshot import import_sac
     from tcmrl_data.build.build import BuildReport, build_dataset
     from tcmrl_data.build.events import BuildEvent, BuildStatus, build_status
@@ -16,22 +17,24 @@ if TYPE_CHECKING:
     from tcmrl_data.dataset.listing import list_datasets
     from tcmrl_data.dataset.returns import return_table
     from tcmrl_data.dataset.selection import Selection
-    from tcmrl_data.engine.base import Unit
+    from tcmrl_data.engine.base import ENGINES, Unit
     from tcmrl_data.engine.worker import serve
     from tcmrl_data.envs.base import (
+        ENVIRONMENTS,
         Environment,
         Lanes,
-        environment_types,
         make_environment,
     )
     from tcmrl_data.envs.controller import Controller, Transition, UniformController
     from tcmrl_data.envs.recorder import Recorder
     from tcmrl_data.envs.rollout import roll_out
+    from tcmrl_data.envs.tasks import Task, draw_tasks
     from tcmrl_data.envs.trajectory import Trajectory
     from tcmrl_data.foundation.canonical import canonical_json, parse_json
     from tcmrl_data.foundation.errors import CheckpointError, SelectionError, TcmrlError, TrainingError
     from tcmrl_data.foundation.plugins import plugin
     from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator, keyed_seed
+    from tcmrl_data.interchange.formats.base import FORMATS
     from tcmrl_data.recipe.recipe import (
         PROFILES,
         Recipe,
@@ -40,7 +43,7 @@ if TYPE_CHECKING:
         list_environments,
         load_recipe,
     )
-    from tcmrl_data.recipe.tasks import Task, draw_tasks, parse_indices
+    from tcmrl_data.recipe.tasks import parse_indices
     from tcmrl_data.sampling.batch import Batch, BatchSizes, Moments, Steps
     from tcmrl_data.sampling.cache import (
         CacheEntry,
@@ -63,12 +66,12 @@ _HOMES = {
     "foundation.canonical": ("canonical_json", "parse_json"),
     "dataset.dataset": ("Dataset", "open_dataset"),
     "foundation.plugins": ("plugin",),
-    "engine.base": ("Unit",),
+    "engine.base": ("ENGINES", "Unit"),
     "engine.worker": ("serve",),
     "envs.base": (
+        "ENVIRONMENTS",
         "Environment",
         "Lanes",
-        "environment_types",
         "make_environment",
     ),
     "envs.controller": ("Controller", "Transition", "UniformController"),
@@ -101,8 +104,11 @@ _HOMES = {
     "sampling.prefetch": ("Prefetch",),
     "foundation.seeding": ("NO_TASK", "Purpose", "keyed_generator", "keyed_seed"),
     "dataset.selection": ("Selection",),
+    "behavior.base": ("BEHAVIOR_SOURCES",),
+    "interchange.formats.base": ("FORMATS",),
     "behavior.snapshot": ("import_sac",),
-    "recipe.tasks": ("Task", "draw_tasks", "parse_indices"),
+    "envs.tasks": ("Task", "draw_tasks"),
+    "recipe.tasks": ("parse_indices",),
     "envs.trajectory": ("Trajectory",),
     "verification.garbage": ("Garbage", "collect_garbage"),
     "verification.repair": ("RepairReport", "repair_dataset"),
@@ -112,6 +118,10 @@ _HOMES = {
 _HOME_OF = {name: home for home, names in _HOMES.items() for name in names}
 
 __all__ = [
+    "BEHAVIOR_SOURCES",
+    "ENGINES",
+    "ENVIRONMENTS",
+    "FORMATS",
     "NO_TASK",
     "PROFILES",
     "Batch",
@@ -158,7 +168,6 @@ __all__ = [
     "clear_cache",
     "collect_garbage",
     "draw_tasks",
-    "environment_types",
     "first_problem",
     "import_sac",
     "keyed_generator",

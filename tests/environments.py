@@ -14,7 +14,15 @@ from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.trajectory import Trajectory
 
 ML1_IN_FULL = ("ml1/reach", "ml1/door-close", "ml1/stick-pull")
+MOST_MEMBERS = 3
 STEPS = 25
+
+
+def some_members(family: type[Environment]) -> list[str]:
+    """The family's environments, or three evenly spaced ones of many."""
+    names = family.members()
+    number = min(MOST_MEMBERS, len(names))
+    return [names[index * (len(names) - 1) // max(1, number - 1)] for index in range(number)]
 
 
 def environment_of(name: str, *overrides: str) -> Environment:

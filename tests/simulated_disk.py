@@ -6,7 +6,6 @@ import signal
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Literal
 
 import pytest
@@ -55,7 +54,7 @@ class PreparedParts:
                     else:
                         yield Result(unit.id, True, "digest", None, 1, "here")
 
-        patch.setattr(build, "plugin", lambda *names: SimpleNamespace(Engine=Engine))
+        patch.setattr(build.ENGINES, "get", lambda name: Engine)
         return tcmrl_data.build_dataset(self.recipe, out, tasks=[task], workers=1)
 
 

@@ -14,7 +14,7 @@ from torch.utils.data import DataLoader
 
 from tcmrl_data import BatchSizes, Dataset, Purpose, Selection, Trajectory, keyed_seed
 from tcmrl_data.foundation.errors import MissingPackageError, SelectionError, StoreError
-from tcmrl_data.interchange.formats import minari as minari_format
+from tcmrl_data.interchange.formats.minari import MinariFormat
 from tcmrl_data.interchange.views.sb3_buffer import to_sb3_buffer
 from tcmrl_data.interchange.views.tensordict import to_tensordict, view_steps
 from tests.conftest import TASKS
@@ -179,7 +179,7 @@ def test_minari_opens_iterates_and_samples_what_was_exported(
 ) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "elsewhere"))
-    files = minari_format.export(tiny, tmp_path / "out", snapshots="steps>=100")
+    files = MinariFormat().export(tiny, tmp_path / "out", snapshots="steps>=100")
     assert os.environ["MINARI_DATASETS_PATH"] == str(tmp_path / "elsewhere")
     assert not (tmp_path / "elsewhere").exists()
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
@@ -210,7 +210,7 @@ def test_minari_refuses_an_episode_without_steps(
     empty = Trajectory(np.zeros((1, 2)), np.zeros((0, 2)), np.zeros(0), none, none)
     monkeypatch.setattr(Dataset, "trajectories", lambda self, task, step: [empty])
     with pytest.raises(StoreError, match=r"step_0000150: episode 0 has no steps.*hdf5"):
-        minari_format.export(tiny, tmp_path / "out", snapshots="last")
+        MinariFormat().export(tiny, tmp_path / "out", snapshots="last")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -219,7 +219,7 @@ def test_minari_knows_the_scores_and_makes_the_task_again(
 ) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.chdir(tmp_path)
-    minari_format.export(tiny, Path("out"), snapshots="last")
+    MinariFormat().export(tiny, Path("out"), snapshots="last")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
     opened = minari.load_dataset("tcmrl/point-robot/task00040-last-v0")
     references = tiny.references(40)
@@ -249,7 +249,7 @@ def test_minari_knows_the_scores_and_makes_the_task_again(
 @pytest.mark.parametrize(
     ("package", "extra", "use"),
     [
-        ("minari", "minari", lambda data, out: minari_format.export(data, out)),
+        ("minari", "minari", lambda data, out: MinariFormat().export(data, out)),
         ("tensordict", "tensordict", lambda data, out: to_tensordict(data.select())),
     ],
 )

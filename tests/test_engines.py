@@ -18,20 +18,18 @@ import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
 from tcmrl_data.build.unit import UnitSpec
 from tcmrl_data.engine import _attempt
-from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
+from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import BuildError
-from tcmrl_data.foundation.plugins import modules, plugin
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import part_folder, read_manifest
 from tests.conftest import TASKS, TINY
 from tests.workers import ROOT, command_line, killer, wait_for, worker_pids
 
-ENGINES = [
-    pytest.param(module.NAME, marks=[pytest.mark.loopback] if module.Engine.takes_address else [])
-    for module in modules("tcmrl_data.engine")
-    if hasattr(module, "NAME")
+CASES = [
+    pytest.param(name, marks=[pytest.mark.loopback] if engine.takes_address else [])
+    for name, engine in ENGINES.working().items()
 ]
 
 LONG = (*TINY, "behavior.sac.steps=100000", "behavior.sac.snapshots=[0,100,100000]")
@@ -47,10 +45,7 @@ class EngineCase:
     mark: str
 
     def create(self, workers: int) -> BaseEngine:
-        engine: BaseEngine = plugin("tcmrl_data.engine", "engine", self.name).Engine(
-            workers, address=self.address
-        )
-        return engine
+        return ENGINES.get(self.name)(workers, address=self.address)
 
     def command(self, out: Path, *, tasks: str, workers: int, overrides: tuple[str, ...] = TINY) -> list[str]:
         """Arguments of `tcmrl-data` that build a part of the tiny dataset with this engine."""
@@ -60,9 +55,9 @@ class EngineCase:
         return [*command, "--tasks", tasks, "--workers", str(workers), "--out", str(out)]
 
 
-@pytest.fixture(scope="module", params=ENGINES)
+@pytest.fixture(scope="module", params=CASES)
 def engine(request: pytest.FixtureRequest, mark: str) -> EngineCase:
-    networked = plugin("tcmrl_data.engine", "engine", request.param).Engine.takes_address
+    networked = ENGINES.get(request.param).takes_address
     address = request.getfixturevalue("ray_cluster").address if networked else None
     return EngineCase(request.param, address, mark)
 
@@ -198,7 +193,7 @@ def test_a_poison_unit_is_named_the_others_are_done_and_the_exit_code_is_1(
     ("engine", "number"),
     [
         pytest.param("local", signal.SIGINT, id="local-SIGINT"),
-        *(pytest.param(*each.values, signal.SIGTERM, marks=each.marks) for each in ENGINES),
+        *(pytest.param(*each.values, signal.SIGTERM, marks=each.marks) for each in CASES),
     ],
     indirect=["engine"],
 )
@@ -297,7 +292,7 @@ def test_parts_whose_messages_are_lost_are_taken_in_all_the_same(
     tiny_recipe: Recipe, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker can be killed between publishing a part and telling of it."""
-    local = plugin("tcmrl_data.engine", "engine", "local").Engine
+    local = ENGINES.get("local")
     run_and_tell = local.run
 
     def run_silently(self: BaseEngine, units: list[Unit], on_message: Message) -> Iterator[Result]:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tcmrl_data.envs.base import environment_types
+from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.foundation.errors import TaskError
 from tests.environments import ML1_IN_FULL, actions_of, environment_of, episodes, parameters_of
@@ -16,12 +16,12 @@ def test_the_task_sets_are_meta_worlds() -> None:
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
     from metaworld.policies import ENV_POLICY_MAP
 
-    names = {f"{name.removeprefix('ml1/')}-v3" for name in environment_types() if name.startswith("ml1/")}
+    names = {f"{name.removeprefix('ml1/')}-v3" for name in ENVIRONMENTS.members() if name.startswith("ml1/")}
     assert len(names) == 50
     assert names == set(ALL_V3_ENVIRONMENTS) == set(ENV_POLICY_MAP)
 
 
-@pytest.mark.parametrize("name", [name for name in environment_types() if name.startswith("ml1/")])
+@pytest.mark.parametrize("name", [name for name in ENVIRONMENTS.members() if name.startswith("ml1/")])
 def test_every_task_set_has_a_recipe_and_an_expert(name: str) -> None:
     environment = environment_of(name)
     assert environment.name == name

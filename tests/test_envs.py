@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tcmrl_data.envs.base import environment_types
+from tcmrl_data.envs._simulation import SimulatedTask
+from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.envs.controller import UniformController
-from tcmrl_data.recipe.tasks import draw_tasks
-from tests.environments import ML1_IN_FULL, actions_of, environment_of, episodes, parameters_of, play
+from tcmrl_data.envs.tasks import draw_tasks
+from tests.environments import actions_of, environment_of, episodes, parameters_of, play, some_members
 
-NAMES = [name for name in environment_types() if not name.startswith("ml1/")] + list(ML1_IN_FULL)
-ENDLESS = [name for name in NAMES if "rand-params" not in name]
-SIMULATED = [name for name in NAMES if "point-robot" not in name]
+NAMES = [name for family in ENVIRONMENTS.working().values() for name in some_members(family)]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -98,13 +97,15 @@ def test_split_is_a_partition_that_a_build_seed_cannot_move(name: str) -> None:
     assert [task.split for task in other] != [task.split for task in tasks]
 
 
-@pytest.mark.parametrize("name", ENDLESS)
-def test_episodes_end_at_the_horizon_and_never_before(name: str) -> None:
+@pytest.mark.parametrize("name", NAMES)
+def test_an_episode_that_does_not_terminate_is_truncated_at_the_horizon(name: str) -> None:
     environment = environment_of(name, "environment.horizon=9")
-    (episode,) = episodes(environment, UniformController(), [parameters_of(name)[0]])
-    assert len(episode) == 9
-    assert not episode.terminated.any()
-    assert episode.truncated.tolist() == [False] * 8 + [True]
+    for episode in episodes(environment, UniformController(), list(parameters_of(name)[:3])):
+        steps = len(episode)
+        assert not episode.terminated[:-1].any()
+        assert not episode.truncated[:-1].any()
+        assert episode.terminated[-1] or steps == 9
+        assert episode.truncated[-1] == (steps == 9)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -132,10 +133,13 @@ def test_actions_beyond_the_box_act_like_its_border(name: str) -> None:
     assert play(environment.make(task), beyond, seed=0) == clipped
 
 
-@pytest.mark.parametrize("name", SIMULATED)
-def test_fingerprint_names_model_step_and_versions(name: str) -> None:
-    fingerprint = environment_of(name).fingerprint()
+@pytest.mark.parametrize("name", NAMES)
+def test_fingerprint_is_json_and_names_what_mujoco_simulates(name: str) -> None:
+    environment = environment_of(name)
+    fingerprint = environment.fingerprint()
     assert json.loads(json.dumps(fingerprint)) == fingerprint == environment_of(name).fingerprint()
+    if not isinstance(environment.make(parameters_of(name)[0]), SimulatedTask):
+        return
     assert fingerprint["dt"] == pytest.approx(fingerprint["timestep"] * fingerprint["frame_skip"])
     assert len(fingerprint["model_sha256"]) == 64
     assert fingerprint["versions"]["mujoco"] == mujoco.__version__
@@ -143,9 +147,9 @@ def test_fingerprint_names_model_step_and_versions(name: str) -> None:
 
 def test_listing_environments_imports_nothing_heavy() -> None:
     script = (
-        "import sys; from tcmrl_data.envs.base import environment_types; names = environment_types();"
+        "import sys; from tcmrl_data.envs.base import ENVIRONMENTS; names = ENVIRONMENTS.members();"
         "heavy = {'mujoco', 'metaworld', 'torch', 'stable_baselines3'} & set(sys.modules);"
         "print(len(names), sorted(heavy))"
     )
     shown = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert shown.stdout.split(maxsplit=1) == ["56", "[]\n"]
+    assert shown.stdout.split(maxsplit=1) == [str(len(ENVIRONMENTS.members())), "[]\n"]

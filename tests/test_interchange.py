@@ -10,19 +10,16 @@ from hypothesis import strategies as st
 
 from tcmrl_data import Dataset, Trajectory
 from tcmrl_data.foundation.errors import SelectionError, StoreError
-from tcmrl_data.foundation.plugins import modules, plugin
-from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS, export, read_hdf5
+from tcmrl_data.interchange.formats.base import FORMATS
+from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS, Hdf5Format, read_hdf5
 from tests.conftest import TASKS
 from tests.strategies import trajectories
-
-FOLDER = "tcmrl_data.interchange.formats"
-FORMATS = [module.NAME for module in modules(FOLDER) if hasattr(module, "NAME")]
 
 
 @pytest.fixture(scope="module")
 def exported(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("exports") / "flat"
-    export(tiny, out)
+    Hdf5Format().export(tiny, out)
     return out
 
 
@@ -37,20 +34,20 @@ def assert_equal(left: Trajectory, right: Trajectory) -> None:
         np.testing.assert_array_equal(array, right.extras[name])
 
 
-@pytest.mark.parametrize("name", FORMATS)
+@pytest.mark.parametrize("name", FORMATS.names())
 class TestEveryFormat:
     """What `tcmrl-data export` relies on, whatever the format."""
 
     @pytest.fixture(autouse=True)
     def library(self, name: str) -> None:
-        if name == "minari":  # comes with an extra
-            pytest.importorskip(name)
+        for package in FORMATS.get(name).optional_packages:
+            pytest.importorskip(package)
 
     def test_reports_progress_and_returns_existing_files(
         self, name: str, tiny: Dataset, tmp_path: Path
     ) -> None:
         seen: list[tuple[int, int]] = []
-        files = plugin(FOLDER, "format", name).export(
+        files = FORMATS.get(name)().export(
             tiny, tmp_path / "out", snapshots="last", progress=lambda done, total: seen.append((done, total))
         )
         assert seen == [(done, 5) for done in range(1, 6)]
@@ -60,7 +57,7 @@ class TestEveryFormat:
     def test_refuses_a_folder_in_use(self, name: str, tiny: Dataset, tmp_path: Path) -> None:
         (tmp_path / "mine").write_text("mine")
         with pytest.raises(StoreError, match="not empty"):
-            plugin(FOLDER, "format", name).export(tiny, tmp_path, snapshots="all")
+            FORMATS.get(name)().export(tiny, tmp_path, snapshots="all")
         assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
     def test_a_failure_leaves_nothing(
@@ -75,12 +72,12 @@ class TestEveryFormat:
 
         monkeypatch.setattr(Dataset, "trajectories", fail_late)
         with pytest.raises(StoreError, match="damaged"):
-            plugin(FOLDER, "format", name).export(tiny, tmp_path / "out", snapshots="all")
+            FORMATS.get(name)().export(tiny, tmp_path / "out", snapshots="all")
         assert list(tmp_path.iterdir()) == []
 
     def test_refuses_a_rule_that_leaves_nothing(self, name: str, tiny: Dataset, tmp_path: Path) -> None:
         with pytest.raises(SelectionError):
-            plugin(FOLDER, "format", name).export(tiny, tmp_path / "out", snapshots="steps>=1000")
+            FORMATS.get(name)().export(tiny, tmp_path / "out", snapshots="steps>=1000")
         assert list(tmp_path.iterdir()) == []
 
 
@@ -128,7 +125,7 @@ def test_hdf5_says_where_it_comes_from(tiny: Dataset, exported: Path) -> None:
 
 
 def test_hdf5_takes_a_selection_of_snapshots(tiny: Dataset, tmp_path: Path) -> None:
-    export(tiny, tmp_path / "last", snapshots="last")
+    Hdf5Format().export(tiny, tmp_path / "last", snapshots="last")
     back = read_hdf5(tmp_path / "last" / "task_00000.hdf5")
     for left, right in zip(tiny.trajectories(0, 150), back, strict=True):
         assert_equal(left, right)
@@ -143,7 +140,7 @@ def test_hdf5_round_trip_of_any_episodes(
     out = tmp_path_factory.mktemp("round-trip") / "flat"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Dataset, "trajectories", lambda self, task, step: episodes)
-        export(tiny, out, snapshots="steps>=100")
+        Hdf5Format().export(tiny, out, snapshots="steps>=100")
     for left, right in zip(episodes * 2, read_hdf5(out / "task_00000.hdf5"), strict=True):
         assert_equal(left, right)
     with h5py.File(out / "task_00000.hdf5") as file:

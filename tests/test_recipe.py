@@ -3,14 +3,14 @@ from itertools import pairwise
 import pytest
 
 from tcmrl_data import apply_overrides, load_recipe
-from tcmrl_data.envs.base import environment_types
+from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
 from tcmrl_data.recipe.recipe import PROFILES, recipe_names
 from tcmrl_data.recipe.tasks import choose_tasks
 
 
 def test_every_environment_has_a_recipe() -> None:
-    assert recipe_names() == sorted(environment_types())
+    assert recipe_names() == ENVIRONMENTS.members()
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from tcmrl_data import Recipe, load_recipe, open_dataset
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.behavior.stacked import Settings, Source, _make_training
+from tcmrl_data.behavior.stacked.source import StackedSettings, StackedSource, _make_training
 from tcmrl_data.behavior.stacked.training import GroupTraining
 from tcmrl_data.build.unit import UnitSpec, unit_memory
 from tcmrl_data.foundation.canonical import canonical_json
@@ -68,12 +68,12 @@ def context_of(
     )
 
 
-def source_of(recipe: Recipe) -> Source:
-    return Source(settings_of(recipe))
+def source_of(recipe: Recipe) -> StackedSource:
+    return StackedSource(settings_of(recipe))
 
 
-def settings_of(recipe: Recipe) -> Settings:
-    return Settings.model_validate_json(canonical_json(recipe.behavior["settings"]))
+def settings_of(recipe: Recipe) -> StackedSettings:
+    return StackedSettings.model_validate_json(canonical_json(recipe.behavior["settings"]))
 
 
 def snapshots_of(recipe: Recipe, context: BehaviorContext) -> dict[tuple[int, int], Snapshot]:

@@ -3,8 +3,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tcmrl_data import load_recipe
+from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.foundation.errors import TaskError
-from tcmrl_data.recipe.tasks import Task, choose_tasks, draw_tasks, parse_indices, spread
+from tcmrl_data.recipe.tasks import choose_tasks, parse_indices, spread
 
 
 def test_the_split_never_moves() -> None:

@@ -15,7 +15,7 @@ from tcmrl_algo.experiment.results import RunResult, error_file, read_results, r
 from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_algo.training.records import read_record, write_file, write_record
 from tcmrl_algo.training.train import usable_device
-from tcmrl_data import CheckpointError, TrainingError, Unit, plugin
+from tcmrl_data import ENGINES, CheckpointError, TrainingError, Unit
 
 WORKER = "tcmrl_algo.experiment.job"
 
@@ -205,7 +205,7 @@ def _run(jobs: dict[str, Job], workers: int) -> Iterator[tuple[str, str | None]]
         )
         for name, job in jobs.items()
     ]
-    engine = plugin("tcmrl_data.engine", "engine", "local").Engine(workers)
+    engine = ENGINES.get("local")(workers)
     with contextlib.closing(engine.run(units, lambda unit, message: None)) as results:
         for result in results:
             yield result.id, None if result.ok else result.error

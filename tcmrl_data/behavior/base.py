@@ -1,15 +1,18 @@
-"""Behavior sources, one a file: each has NAME, a Settings class, and a Source that yields snapshots."""
+"""Behavior sources make the policies of which a dataset holds rollouts."""
 
 import abc
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
+
+from pydantic import BaseModel
 
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.envs.base import Environment, Reward
 from tcmrl_data.envs.controller import View
-from tcmrl_data.recipe.tasks import Task
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.foundation.plugins import Registry
 
 
 @dataclass(frozen=True)
@@ -36,7 +39,20 @@ class BehaviorContext:
 
 
 class BehaviorSource(abc.ABC):
-    """Makes the behavior policies of tasks; `settings` is an instance of the module's Settings."""
+    """Makes the behavior policies of tasks; a plug-in of the entry point group `tcmrl.behavior`.
+
+    Args:
+        settings: an instance of `Settings`.
+    """
+
+    name: ClassVar[str]
+    Settings: ClassVar[type[BaseModel]]
+    """The recipe's `[behavior.<name>]` table."""
+    extends: ClassVar[str | None] = None
+    """The source whose table holds the values that `[behavior.<name>]` leaves out."""
+
+    def __init__(self, settings: BaseModel) -> None:
+        self.settings = settings
 
     @property
     @abc.abstractmethod
@@ -64,3 +80,6 @@ class BehaviorSource(abc.ABC):
     @abc.abstractmethod
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
         """Yields every (task, snapshot) of the unit, each task's in ascending order of steps."""
+
+
+BEHAVIOR_SOURCES = Registry("tcmrl.behavior", "behavior source", BehaviorSource)

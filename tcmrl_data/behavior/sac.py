@@ -11,18 +11,17 @@ from tcmrl_data.behavior._sac_state import capture, restore
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.snapshot import Snapshot, snapshot_of_sac
 from tcmrl_data.envs.base import Environment
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
-from tcmrl_data.recipe.tasks import Task
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
 
-NAME = "sac"
 REPORT_EVERY = 100
 """Updates between two reports of progress."""
 
 
-class Settings(BaseModel):
+class SacSettings(BaseModel):
     """The `[behavior.sac]` table; names as in Stable-Baselines3's SAC, defaults in the recipes.
 
     Attributes:
@@ -51,7 +50,7 @@ class Settings(BaseModel):
     entropy: Literal["auto"] | float = "auto"
 
     @model_validator(mode="after")
-    def _snapshots_fit(self) -> "Settings":
+    def _snapshots_fit(self) -> "SacSettings":
         steps = self.snapshots
         if steps[0] != 0 or list(steps) != sorted(set(steps)) or steps[-1] != self.steps:
             raise ValueError(f"snapshots must rise from 0 to steps ({self.steps}), got {list(steps)}")
@@ -63,22 +62,23 @@ class Settings(BaseModel):
 
 
 @final
-class Source(BehaviorSource):
+class SacSource(BehaviorSource):
     """Trains the tasks of a unit one after another."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._settings = settings
+    name = "sac"
+    Settings = SacSettings
+    settings: SacSettings
 
     @property
     def steps(self) -> tuple[int, ...]:
-        return self._settings.snapshots
+        return self.settings.snapshots
 
     @property
     def training_steps(self) -> int:
-        return self._settings.steps
+        return self.settings.steps
 
     def training_bytes(self, environment: Environment, num_tasks: int) -> int:
-        return training_bytes(self._settings, environment, num_agents=1)
+        return training_bytes(self.settings, environment, num_agents=1)
 
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
         for task in context.tasks:
@@ -90,7 +90,7 @@ class Source(BehaviorSource):
         SB3's `learn` called in chunks does what one call does, so neither chunks nor checkpoints change
         a result.
         """
-        settings, checkpoints = self._settings, context.checkpoints([task])
+        settings, checkpoints = self.settings, context.checkpoints([task])
         episodes = KeyedResets(context, task)
         seed = keyed_seed(context.seed, context.environment.name, task.index, Purpose.BEHAVIOR)
         model = make_model(settings, episodes, seed=seed)
@@ -113,7 +113,7 @@ class Source(BehaviorSource):
                 yield snapshot_of_sac(model, step=step, observation=context.observation)
 
 
-def training_bytes(settings: Settings, environment: Environment, *, num_agents: int) -> int:
+def training_bytes(settings: SacSettings, environment: Environment, *, num_agents: int) -> int:
     """Most memory that training some agents at once takes.
 
     What a checkpoint keeps (replay buffers, weights and their moments) counts three times: the checkpoint
@@ -134,7 +134,7 @@ def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
     return sum((before + 1) * after for before, after in pairwise((inputs, *hidden, outputs)))
 
 
-def make_model(settings: Settings, environment: gymnasium.Env[Any, Any], *, seed: int) -> "SAC":
+def make_model(settings: SacSettings, environment: gymnasium.Env[Any, Any], *, seed: int) -> "SAC":
     """An untrained SAC; seeds the global generators of Python, NumPy and torch, as SB3 does."""
     from stable_baselines3 import SAC
     from stable_baselines3.common.logger import Logger

@@ -8,12 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.snapshot import ScriptedPolicy, Snapshot
 from tcmrl_data.envs.base import Environment
-from tcmrl_data.recipe.tasks import Task
-
-NAME = "scripted"
+from tcmrl_data.envs.tasks import Task
 
 
-class Settings(BaseModel):
+class ScriptedSettings(BaseModel):
     """The `[behavior.scripted]` table.
 
     Attributes:
@@ -25,22 +23,23 @@ class Settings(BaseModel):
     noise: tuple[float, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _noisiest_first(self) -> "Settings":
+    def _noisiest_first(self) -> "ScriptedSettings":
         if list(self.noise) != sorted(set(self.noise), reverse=True) or min(self.noise) < 0:
             raise ValueError(f"noise must fall from noisiest to cleanest, got {list(self.noise)}")
         return self
 
 
 @final
-class Source(BehaviorSource):
+class ScriptedSource(BehaviorSource):
     """Experts need no training; they always see the full observation."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._noise = settings.noise
+    name = "scripted"
+    Settings = ScriptedSettings
+    settings: ScriptedSettings
 
     @property
     def steps(self) -> tuple[int, ...]:
-        return tuple(range(len(self._noise)))
+        return tuple(range(len(self.settings.noise)))
 
     @property
     def training_steps(self) -> int:
@@ -51,5 +50,5 @@ class Source(BehaviorSource):
 
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
         for task in context.tasks:
-            for step, noise in enumerate(self._noise):
+            for step, noise in enumerate(self.settings.noise):
                 yield task, Snapshot(step, ScriptedPolicy(observation="full", noise=noise))

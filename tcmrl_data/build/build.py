@@ -10,12 +10,12 @@ from typing import Any
 from tcmrl_data.build.driver import Driver
 from tcmrl_data.build.events import EVENTS, BuildEvent, EventLog
 from tcmrl_data.build.part import part_bytes
-from tcmrl_data.engine.base import BaseEngine
+from tcmrl_data.engine.base import ENGINES
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, StorageError
-from tcmrl_data.foundation.plugins import plugin
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import Task, choose_tasks
+from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import DATA_VERSION, MANIFEST, read_manifest
 from tcmrl_data.verification.scan import check_work_files
 
@@ -71,7 +71,7 @@ def build_dataset(
         StorageError: too little free space, or the disk refused; what was published stands.
     """
     started = time.monotonic()
-    runner: BaseEngine = plugin("tcmrl_data.engine", "engine", engine).Engine(workers, address=address)
+    runner = ENGINES.get(engine)(workers, address=address)
     chosen = choose_tasks(recipe, tasks)
     _check_folder(out, recipe, seed)
     make_folders(out)

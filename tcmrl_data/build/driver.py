@@ -9,11 +9,12 @@ from typing import Any
 from tcmrl_data.build.events import BuildEvent, EventKind, EventLog
 from tcmrl_data.build.unit import UnitSpec, behavior_source, unit_memory
 from tcmrl_data.engine.base import BaseEngine, Result, Unit
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import Task, group_tasks
+from tcmrl_data.recipe.tasks import group_tasks
 from tcmrl_data.store.layout import GROUP, check_layout
 from tcmrl_data.store.manifest import (
     DATA_VERSION,

@@ -11,13 +11,13 @@ from tcmrl_data.build.provenance import provenance
 from tcmrl_data.envs.base import Environment, Lanes
 from tcmrl_data.envs.controller import Controller, UniformController
 from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
 from tcmrl_data.foundation.disk import publish_folder
 from tcmrl_data.foundation.errors import NondeterminismError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import Task
 from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
 from tcmrl_data.store.manifest import (
     DATA_VERSION,

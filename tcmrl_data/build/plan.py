@@ -15,9 +15,10 @@ from tcmrl_data.build.unit import behavior_source, unit_memory
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import Task, choose_tasks, group_tasks
+from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
 
 PROBE_SECONDS = 6.0
 UNIT_START_SECONDS = 3.0

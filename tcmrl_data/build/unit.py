@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
+from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.build.part import PartMaker, Report, part_bytes
 from tcmrl_data.build.provenance import package_versions
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import canonical_json, digest
-from tcmrl_data.foundation.plugins import plugin
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import Task
 from tcmrl_data.store.manifest import DATA_VERSION, part_folder, read_part_record
 
 PROCESS_BYTES = 400 * 2**20
@@ -60,11 +59,8 @@ class UnitSpec:
 
 def behavior_source(recipe: Recipe) -> BehaviorSource:
     """The recipe's behavior source with its settings."""
-    module = plugin("tcmrl_data.behavior", "behavior source", recipe.behavior["source"])
-    source: BehaviorSource = module.Source(
-        module.Settings.model_validate_json(canonical_json(recipe.behavior["settings"]))
-    )
-    return source
+    kind = BEHAVIOR_SOURCES.get(recipe.behavior["source"])
+    return kind(kind.Settings.model_validate_json(canonical_json(recipe.behavior["settings"])))
 
 
 def unit_memory(recipe: Recipe, num_tasks: int) -> int:

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.recipe.tasks import Task
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.dataset import Dataset

@@ -1,11 +1,12 @@
-"""Engines run units somewhere, one engine a file: each module has NAME and a class Engine."""
+"""Engines run units somewhere, one engine a file."""
 
 import abc
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.plugins import Registry
 
 ATTEMPTS = 2
 """A unit that crashed or ran out of time is tried once more; an error that it reports itself is final."""
@@ -63,7 +64,7 @@ class Result:
 
 
 class BaseEngine(abc.ABC):
-    """Runs units, each at least once, in any order.
+    """Runs units, each at least once, in any order; a plug-in of the entry point group `tcmrl.engines`.
 
     Args:
         workers: units at a time; as many as there is room for where None.
@@ -73,7 +74,9 @@ class BaseEngine(abc.ABC):
         BuildError: the engine takes no address.
     """
 
-    takes_address = False
+    name: ClassVar[str]
+    takes_address: ClassVar[bool] = False
+    """Whether the engine reaches other machines, at an address."""
 
     def __init__(self, workers: int | None = None, *, address: str | None = None) -> None:
         if address is not None and not self.takes_address:
@@ -87,6 +90,9 @@ class BaseEngine(abc.ABC):
         Raises:
             BuildError: a unit asks for more than any machine has; nothing was started.
         """
+
+
+ENGINES = Registry("tcmrl.engines", "engine", BaseEngine)
 
 
 def longest_first(units: Sequence[Unit]) -> list[Unit]:

@@ -11,12 +11,12 @@ from typing import Any, final
 from tcmrl_data.engine._attempt import Outcome, run_attempt
 from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
 
-NAME = "local"
-
 
 @final
-class Engine(BaseEngine):
+class LocalEngine(BaseEngine):
     """Up to `workers` processes on this machine, one per core where None."""
+
+    name = "local"
 
     def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
         events: queue.SimpleQueue[tuple[str, Mapping[str, Any]] | Future[Result]] = queue.SimpleQueue()

@@ -17,7 +17,6 @@ from tcmrl_data.engine._attempt import GRACE_SECONDS, Outcome, run_attempt
 from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
 from tcmrl_data.foundation.errors import BuildError
 
-NAME = "ray"
 LOST_RETRIES = 3
 """How often Ray itself tries an attempt again that was lost with its machine."""
 
@@ -28,9 +27,10 @@ OBJECT_STORE_BYTES = 100_000_000
 
 
 @final
-class Engine(BaseEngine):
+class RayEngine(BaseEngine):
     """Works on the cluster at `address`, or on one that is started here for the build and ended with it."""
 
+    name = "ray"
     takes_address = True
 
     def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:

@@ -1,1 +1,1 @@
-"""Environment families, one a file; each module maps names to classes in ENVIRONMENTS."""
+"""Environment families, one a file; plug-ins of the entry point group `tcmrl.environments`."""

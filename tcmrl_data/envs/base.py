@@ -1,9 +1,11 @@
 """What an environment is: settings, task parameters, a Gymnasium environment, and lanes stepped together."""
 
 import abc
+import importlib.resources
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from importlib.resources.abc import Traversable
 from typing import Any, ClassVar, Literal, final
 
 import gymnasium
@@ -13,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
-from tcmrl_data.foundation.plugins import modules, unknown_name
+from tcmrl_data.foundation.plugins import Registry, unknown_name
 
 Parameters = Mapping[str, Any]
 """JSON values that define one task."""
@@ -95,9 +97,11 @@ class Environment(abc.ABC):
     """A family of tasks with one state and action space.
 
     Subclasses set the class attributes and are final; nothing heavy (mujoco, metaworld) is imported
-    before a task is made.
+    before a task is made. They are plug-ins of the entry point group `tcmrl.environments`.
     """
 
+    name: str
+    """On the class, the plug-in's name; on an instance, the environment's, such as `ml1/reach`."""
     Settings: ClassVar[type[EnvironmentSettings]] = EnvironmentSettings
     observation_dim: int
     action_dim: int
@@ -109,6 +113,16 @@ class Environment(abc.ABC):
     def __init__(self, settings: EnvironmentSettings) -> None:
         self.settings = settings
         self.name = settings.name
+
+    @classmethod
+    def members(cls) -> list[str]:
+        """Names of the environments of this class: one, or `<plug-in>/<member>` for a family of several."""
+        return [cls.name]
+
+    @classmethod
+    def recipe_file(cls, name: str) -> Traversable:
+        """The recipe, a TOML file, of the environment `name`; a package of its own brings its own file."""
+        return importlib.resources.files("tcmrl_manifests") / f"{name.partition('/')[0]}.toml"
 
     @abc.abstractmethod
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
@@ -184,27 +198,25 @@ class EnvironmentLanes(Lanes):
             environment.close()
 
 
-def environment_types() -> dict[str, type[Environment]]:
-    """Every environment by name, gathered from the family files in `tcmrl_data/envs`."""
-    found: dict[str, type[Environment]] = {}
-    for module in modules("tcmrl_data.envs"):
-        found.update(getattr(module, "ENVIRONMENTS", {}))
-    return found
+@final
+class EnvironmentRegistry(Registry[Environment]):
+    """Environments by name; a plug-in may be a family of several."""
+
+    def get(self, name: str) -> type[Environment]:
+        family = super().get(name.partition("/")[0])
+        if name not in family.members():
+            raise unknown_name(self.noun, name, family.members())
+        return family
+
+    def members(self) -> list[str]:
+        """The environments of all plug-ins that are not broken, sorted; imports the plug-ins."""
+        return sorted(name for family in self.working().values() for name in family.members())
 
 
-def environment_type(name: str) -> type[Environment]:
-    """The class behind an environment's name.
-
-    Raises:
-        UnknownNameError: no such environment; the message lists the nearest names.
-    """
-    found = environment_types()
-    if name not in found:
-        raise unknown_name("environment", name, found)
-    return found[name]
+ENVIRONMENTS = EnvironmentRegistry("tcmrl.environments", "environment", Environment)
 
 
 def make_environment(settings: Mapping[str, Any]) -> Environment:
     """The environment of a validated `[environment]` table (raises pydantic's error for a bad one)."""
-    kind = environment_type(settings["name"])
+    kind = ENVIRONMENTS.get(settings["name"])
     return kind(kind.Settings.model_validate_json(json.dumps(settings)))

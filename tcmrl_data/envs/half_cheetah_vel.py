@@ -42,6 +42,7 @@ class HalfCheetahVelSettings(EnvironmentSettings):
 class HalfCheetahVel(Environment):
     """Target velocities drawn uniformly; dense reward; episodes end at the horizon only."""
 
+    name = "half-cheetah-vel"
     Settings = HalfCheetahVelSettings
     observation_dim = 17
     action_dim = 6
@@ -88,6 +89,3 @@ def _simulator() -> Any:
     from gymnasium.envs.mujoco.half_cheetah_v5 import HalfCheetahEnv
 
     return HalfCheetahEnv()
-
-
-ENVIRONMENTS: dict[str, type[Environment]] = {"half-cheetah-vel": HalfCheetahVel}

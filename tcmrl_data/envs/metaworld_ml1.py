@@ -52,6 +52,7 @@ class MetaWorldML1Settings(EnvironmentSettings):
 class MetaWorldML1(Environment):
     """One ML1 task set; episodes end at the horizon only; `success` is Meta-World's, per step."""
 
+    name = "ml1"
     Settings = MetaWorldML1Settings
     observation_dim = 39
     action_dim = 4
@@ -61,6 +62,10 @@ class MetaWorldML1(Environment):
     def __init__(self, settings: EnvironmentSettings) -> None:
         super().__init__(settings)
         self._env_name = f"{self.name.removeprefix('ml1/')}-v3"
+
+    @classmethod
+    def members(cls) -> list[str]:
+        return [f"{cls.name}/{task_set}" for task_set in TASK_SETS]
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         vectors = _random_vectors(self._env_name, task_seed)[:num_tasks]
@@ -176,6 +181,3 @@ class ExpertController(Controller):
             )
         clipped: FloatArray = np.clip(actions + self._noise * noise, -1.0, 1.0)
         return clipped
-
-
-ENVIRONMENTS: dict[str, type[Environment]] = {f"ml1/{name}": MetaWorldML1 for name in TASK_SETS}

@@ -61,6 +61,8 @@ class _PointRobot(Environment):
 class PointRobot(_PointRobot):
     """Goals spread over the half circle, dense reward -dist."""
 
+    name = "point-robot"
+
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         return half_circle_goals(num_tasks)
 
@@ -68,6 +70,8 @@ class PointRobot(_PointRobot):
 @final
 class SparsePointRobot(_PointRobot):
     """Goals spread over the half circle, reward only near the goal."""
+
+    name = "sparse-point-robot"
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         return half_circle_goals(num_tasks)
@@ -83,6 +87,8 @@ class SparsePointRobot(_PointRobot):
 @final
 class PointRobotWind(_PointRobot):
     """One goal at (1, 0); each task has a wind that shifts every step."""
+
+    name = "point-robot-wind"
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         random = np.random.RandomState(task_seed)  # the field's generator: all x first, then all y
@@ -175,10 +181,3 @@ class PointRobotEnv(gymnasium.Env[FloatArray, FloatArray]):
             bool(step.truncated[0]),
             {},
         )
-
-
-ENVIRONMENTS: dict[str, type[Environment]] = {
-    "point-robot": PointRobot,
-    "point-robot-wind": PointRobotWind,
-    "sparse-point-robot": SparsePointRobot,
-}

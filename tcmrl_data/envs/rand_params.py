@@ -108,6 +108,7 @@ class _RandParams(Environment):
 class HopperRandParams(_RandParams):
     """One leg; ends when the torso is not above 0.7 m or leans 0.2 rad or more."""
 
+    name = "hopper-rand-params"
     observation_dim = 11
     action_dim = 3
     simulator_bytes = 2 * 2**20
@@ -128,6 +129,7 @@ class HopperRandParams(_RandParams):
 class WalkerRandParams(_RandParams):
     """Two legs; ends when the torso leaves heights (0.8, 2) m or leans 1 rad or more."""
 
+    name = "walker-rand-params"
     observation_dim = 17
     action_dim = 6
     simulator_bytes = 2 * 2**20
@@ -153,9 +155,3 @@ class RandParamsTask(SimulatedTask):
 
     def reward(self, action: FloatArray, simulator_reward: float, info: dict[str, Any]) -> float:
         return float(info["x_velocity"]) + ALIVE_BONUS - CONTROL_COST * squared_norm(action)
-
-
-ENVIRONMENTS: dict[str, type[Environment]] = {
-    "hopper-rand-params": HopperRandParams,
-    "walker-rand-params": WalkerRandParams,
-}

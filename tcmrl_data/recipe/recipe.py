@@ -1,6 +1,5 @@
 """Recipes: hand-written TOML in `manifests/`, resolved once into a validated, frozen configuration."""
 
-import importlib.resources
 import json
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -9,9 +8,9 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from tcmrl_data.envs.base import Environment, environment_type, environment_types, make_environment
+from tcmrl_data.behavior.base import BEHAVIOR_SOURCES
+from tcmrl_data.envs.base import ENVIRONMENTS, Environment, make_environment
 from tcmrl_data.foundation.errors import RecipeError
-from tcmrl_data.foundation.plugins import plugin
 
 Profile = Literal["paper", "quick", "reduced"]
 PROFILES: tuple[Profile, ...] = ("paper", "quick", "reduced")
@@ -109,7 +108,7 @@ class _Behavior(_Table):
 
 def recipe_names() -> list[str]:
     """Every environment that has a recipe."""
-    return [name for name in sorted(environment_types()) if _recipe_file(name).is_file()]
+    return [name for name in ENVIRONMENTS.members() if _recipe_file(name).is_file()]
 
 
 def list_environments() -> list[dict[str, Any]]:
@@ -148,7 +147,7 @@ def load_recipe(
         RecipeError: a profile that the recipe lacks, an unknown key, a wrong type, or values that
             contradict each other.
     """
-    kind = environment_type(name)
+    kind = ENVIRONMENTS.get(name)
     document = _read(name)
     place = f"recipe of {name!r}, profile {profile!r}"
     if profile not in _profiles(document):
@@ -222,16 +221,16 @@ def _validated(kind: type[Table], values: Mapping[str, Any], place: str) -> Tabl
 
 def _behavior_settings(tables: Mapping[str, Any], source: str, place: str) -> BaseModel:
     """The source's settings: its own table, on top of that of the source whose settings it shares."""
-    module = plugin("tcmrl_data.behavior", "behavior source", source)
+    kind = BEHAVIOR_SOURCES.get(source)
     if source not in tables:
         raise RecipeError(f"{place}: behavior source {source!r} has no [behavior.{source}] table")
-    values = _merged(tables.get(getattr(module, "EXTENDS", source), {}), tables[source])
-    settings: BaseModel = _validated(module.Settings, values, f"{place}, [behavior.{source}]")
+    values = _merged(tables.get(kind.extends or source, {}), tables[source])
+    settings: BaseModel = _validated(kind.Settings, values, f"{place}, [behavior.{source}]")
     return settings
 
 
 def _recipe_file(name: str) -> Traversable:
-    return importlib.resources.files("tcmrl_manifests") / f"{name.partition('/')[0]}.toml"
+    return ENVIRONMENTS.get(name).recipe_file(name)
 
 
 def _read(name: str) -> dict[str, Any]:

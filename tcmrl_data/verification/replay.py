@@ -14,8 +14,8 @@ from tcmrl_data.behavior.snapshot import read_snapshot
 from tcmrl_data.build.part import roll_out_part
 from tcmrl_data.build.provenance import provenance
 from tcmrl_data.envs.base import Environment
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import TcmrlError
-from tcmrl_data.recipe.tasks import Task
 from tcmrl_data.store.arrays import pack, read_arrays
 from tcmrl_data.store.layout import DECODED_FLOOR, DECODED_RATIO
 from tcmrl_data.store.manifest import Manifest, PartRecord

@@ -13,66 +13,56 @@ dataset it came from.
 """
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.selection import Selection
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.interchange.formats._new_folder import new_folder
-from tcmrl_data.recipe.tasks import Task
+from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
 
 if TYPE_CHECKING:
     import h5py
 
-NAME = "hdf5"
 FORMAT_VERSION = 1
 EPISODE_ARRAYS = ("observations", "actions", "rewards", "terminated", "truncated")
 CHUNK_ROWS = 4_096
 
 
-def export(
-    dataset: Dataset,
-    out: Path,
-    *,
-    snapshots: str = "all",
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Path]:
-    """Writes one HDF5 file per task into a new folder, one part in memory at a time.
+@final
+class Hdf5Format(Format):
+    """One HDF5 file per task: `task_00000.hdf5` and so on."""
 
-    The folder appears under its name when all files are complete, and not at all when something fails.
+    name = "hdf5"
 
-    Args:
-        dataset: a complete dataset.
-        out: the folder to make; an empty one may stand there.
-        snapshots: a rule of `Dataset.select`.
-        progress: called with the number of parts written and of all parts.
-
-    Returns:
-        The files, `task_00000.hdf5` and so on.
-
-    Raises:
-        SelectionError: the rule cannot be read or leaves nothing of a task, or the dataset is incomplete.
-        StoreError: `out` exists and is not empty.
-    """
-    selection = dataset.select(snapshots=snapshots)
-    total = sum(len(steps) for steps in selection.steps.values())
-    done = 0
-    with new_folder(out) as folder:
-        for task in selection.tasks:
-            for _ in _write_task(selection, task, folder / _file_name(task)):
-                done += 1
-                progress(done, total)
-    return [out / _file_name(task) for task in selection.tasks]
+    def export(
+        self,
+        dataset: Dataset,
+        out: Path,
+        *,
+        snapshots: str = "all",
+        progress: ExportProgress = no_progress,
+    ) -> list[Path]:
+        selection = dataset.select(snapshots=snapshots)
+        total = sum(len(steps) for steps in selection.steps.values())
+        done = 0
+        with new_folder(out) as folder:
+            for task in selection.tasks:
+                for _ in _write_task(selection, task, folder / _file_name(task)):
+                    done += 1
+                    progress(done, total)
+        return [out / _file_name(task) for task in selection.tasks]
 
 
 def read_hdf5(path: str | Path) -> list[Trajectory]:
-    """The episodes of a file that `export` wrote, in order.
+    """The episodes of a file that `Hdf5Format` wrote, in order.
 
     Raises:
         StoreError: the file is missing, no HDF5, or of another format version.

@@ -14,9 +14,9 @@ import contextlib
 import json
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, final
 
 import gymnasium
 import numpy as np
@@ -26,66 +26,58 @@ from gymnasium.spaces import Box
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import make_environment
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import MissingPackageError, StoreError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.interchange.formats._new_folder import new_folder
-from tcmrl_data.recipe.tasks import Task
+from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
 from tcmrl_data.store.manifest import TaskReferences
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
-NAME = "minari"
 NEEDED_BY_TASKS = ("tcmrl", "gymnasium", "mujoco", "metaworld")
 """Packages without which a task cannot be made again."""
 
 
-def export(
-    dataset: Dataset,
-    out: Path,
-    *,
-    snapshots: str = "all",
-    progress: Callable[[int, int], None] = lambda done, total: None,
-) -> list[Path]:
-    """Writes one Minari dataset per task below a new folder, one part in memory at a time.
+@final
+class MinariFormat(Format):
+    """One Minari dataset per task; an episode without steps is a `StoreError`.
 
-    The folder appears under its name when all datasets are complete, and not at all when something fails.
-    While it is written, MINARI_DATASETS_PATH of this process names another folder.
-
-    Args:
-        dataset: a complete dataset.
-        out: the folder to make; an empty one may stand there.
-        snapshots: a rule of `Dataset.select`.
-        progress: called with the number of parts written and of all parts.
-
-    Returns:
-        The files.
-
-    Raises:
-        SelectionError: the rule cannot be read or leaves nothing of a task, or the dataset is incomplete.
-        StoreError: `out` exists and is not empty, or an episode has no steps.
-        MissingPackageError: Minari is not installed.
+    While a dataset is written, MINARI_DATASETS_PATH of this process names another folder.
 
     Example:
         >>> import minari  # doctest: +SKIP
         >>> minari.load_dataset("tcmrl/point-robot/task00000-last-v0")  # doctest: +SKIP
     """
-    try:
-        import minari  # noqa: F401
-    except ImportError as error:
-        raise MissingPackageError(
-            f"format 'minari' needs a package that is missing ({error}); pip install 'tcmrl[minari]'"
-        ) from None
-    selection = dataset.select(snapshots=snapshots)
-    total = sum(len(steps) for steps in selection.steps.values())
-    done = 0
-    with new_folder(out) as folder, _datasets_path(folder):
-        for task in selection.tasks:
-            for _ in _write_task(selection, task, dataset_id(dataset, task.index, snapshots)):
-                done += 1
-                progress(done, total)
-    return sorted(path for path in out.rglob("*") if path.is_file())
+
+    name = "minari"
+    optional_packages = ("minari",)
+
+    def export(
+        self,
+        dataset: Dataset,
+        out: Path,
+        *,
+        snapshots: str = "all",
+        progress: ExportProgress = no_progress,
+    ) -> list[Path]:
+        try:
+            import minari  # noqa: F401
+        except ImportError as error:
+            raise MissingPackageError(
+                f"format 'minari' needs a package that is missing ({error}); pip install 'tcmrl[minari]'"
+            ) from None
+        selection = dataset.select(snapshots=snapshots)
+        total = sum(len(steps) for steps in selection.steps.values())
+        done = 0
+        with new_folder(out) as folder, _datasets_path(folder):
+            for task in selection.tasks:
+                for _ in _write_task(selection, task, dataset_id(dataset, task.index, snapshots)):
+                    done += 1
+                    progress(done, total)
+        return sorted(path for path in out.rglob("*") if path.is_file())
 
 
 def dataset_id(dataset: Dataset, task: int, snapshots: str = "all") -> str:

@@ -1,0 +1,161 @@
+"""The SAC agents of a group of tasks, trained in lockstep: the arithmetic of many small networks at once.
+
+Each agent is an ordinary SAC of its own task, as the source `sac` trains it: same algorithm, same settings,
+its own replay buffer, entropy coefficient and random streams. Only rounding may depend on the group.
+"""
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any, Literal, final
+
+import numpy as np
+from pydantic import Field
+
+from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
+from tcmrl_data.behavior.sac import SacSettings, training_bytes
+from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.envs.base import Environment
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.foundation.errors import BuildError
+
+if TYPE_CHECKING:
+    from tcmrl_data.behavior.stacked.training import GroupTraining
+
+REPORT_EVERY = 20
+"""Environment steps of the group between two reports of progress and looks at the clock."""
+
+
+class StackedSettings(SacSettings):
+    """The `[behavior.stacked]` table: that of `sac`, and how tasks are grouped.
+
+    Attributes:
+        group: task indices per group; part of the data's identity, since it may change rounding.
+        device: where networks and replay buffers lie; another device rounds differently.
+        matmul_precision: torch's, of float32 matrix products: `medium` multiplies in bfloat16 where the
+            processor can, faster, with errors up to about 1e-2 of a product's standard deviation
+            (measured, and recorded with every part). Rollouts are always exact.
+    """
+
+    group: int = Field(ge=1)
+    device: Literal["cpu", "cuda"] = "cpu"
+    matmul_precision: Literal["highest", "medium"] = "highest"
+
+
+@final
+class StackedSource(BehaviorSource):
+    """Trains all tasks of a unit together."""
+
+    name = "stacked"
+    Settings = StackedSettings
+    extends = "sac"
+    settings: StackedSettings
+
+    @property
+    def steps(self) -> tuple[int, ...]:
+        return self.settings.snapshots
+
+    @property
+    def training_steps(self) -> int:
+        return self.settings.steps
+
+    @property
+    def group_size(self) -> int:
+        return self.settings.group
+
+    def training_bytes(self, environment: Environment, num_tasks: int) -> int:
+        return training_bytes(self.settings, environment, num_agents=num_tasks)
+
+    def provenance(self) -> Mapping[str, Any]:
+        settings = self.settings
+        if settings.matmul_precision == "highest":
+            return {}
+        with _matmul_precision(settings.matmul_precision):
+            error = _matmul_error(settings.batch_size, settings.hidden[-1], settings.device)
+        return {"matmul_precision": settings.matmul_precision, "matmul_error": error}
+
+    def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
+        """As for every source; policies with weights that are not finite are left out and reported last.
+
+        Raises:
+            BuildError: after everything else, where the training of a task diverged, or there is no such
+                device.
+        """
+        checkpoints = context.checkpoints(context.tasks)
+        diverged: dict[int, int] = {}
+        with contextlib.closing(_make_training(self.settings, context)) as training:
+            checkpoint = checkpoints.load()
+            steps_done = -1
+            if checkpoint is not None:
+                training.restore(checkpoint)
+                steps_done = training.steps
+                context.report(steps_done * len(context.tasks))
+            for step in self.settings.snapshots:
+                while training.steps < step:
+                    if checkpoints.is_due():
+                        checkpoints.save(training.capture())
+                    chunk = min(REPORT_EVERY, step - training.steps)
+                    with _matmul_precision(self.settings.matmul_precision):
+                        for _ in range(chunk):
+                            training.advance()
+                    context.report(chunk * len(context.tasks))
+                for agent, task in enumerate(context.tasks if step > steps_done else ()):
+                    snapshot = training.snapshot(agent)
+                    if all(np.isfinite(array).all() for array in snapshot.tensors.values()):
+                        yield task, snapshot
+                    else:
+                        diverged.setdefault(task.index, step)
+        if diverged:
+            places = ", ".join(f"task {index} by step {step}" for index, step in diverged.items())
+            raise BuildError(f"behavior training diverged: {places}; use a smaller behavior learning_rate")
+
+
+@contextlib.contextmanager
+def _matmul_precision(precision: str) -> Iterator[None]:
+    """Sets torch's precision of matrix products for a while: everything else in the process keeps its own."""
+    import torch
+
+    before = torch.get_float32_matmul_precision()
+    torch.set_float32_matmul_precision(precision)
+    try:
+        yield
+    finally:
+        torch.set_float32_matmul_precision(before)
+
+
+def _matmul_error(rows: int, width: int, device: str) -> float:
+    """Largest error of a layer's product of normal numbers, in the product's standard deviations."""
+    import torch
+
+    generator = torch.Generator().manual_seed(0)
+    left = torch.randn(1, rows, width, generator=generator)
+    right = torch.randn(1, width, width, generator=generator)
+    product = torch.bmm(left.to(device), right.to(device)).cpu().double()
+    exact = torch.bmm(left.double(), right.double())
+    return float((product - exact).abs().max() / exact.std())
+
+
+def _make_training(settings: StackedSettings, context: BehaviorContext) -> "GroupTraining":
+    """The untrained group."""
+    import torch
+
+    from tcmrl_data.behavior.stacked.learner import Hyperparameters
+    from tcmrl_data.behavior.stacked.training import GroupTraining
+
+    if settings.device == "cuda" and not torch.cuda.is_available():
+        raise BuildError("behavior.stacked.device is 'cuda', but torch finds no CUDA device; use 'cpu'")
+    return GroupTraining(
+        context,
+        Hyperparameters(
+            hidden=settings.hidden,
+            learning_rate=settings.learning_rate,
+            batch_size=settings.batch_size,
+            gamma=settings.gamma,
+            tau=settings.tau,
+            entropy=None if settings.entropy == "auto" else settings.entropy,
+        ),
+        warmup=settings.warmup,
+        train_frequency=settings.train_frequency,
+        gradient_steps=settings.gradient_steps,
+        capacity=min(settings.buffer_size, settings.steps),
+        device=torch.device(settings.device),
+    )
