@@ -15,6 +15,7 @@ from .frame import (
     print_json,
     print_table,
     remark,
+    same_command,
     size,
     stopped_by_signals,
 )
@@ -168,7 +169,7 @@ def build(
     recipe = _load(environment, profile, behavior, overrides)
     chosen = _parse_tasks(recipe, tasks)
     out = out or Path("data") / environment
-    with stopped_by_signals(out), StageProgress(quiet=quiet) as progress:
+    with stopped_by_signals(lambda: same_command(out)), StageProgress(quiet=quiet) as progress:
         report = tcmrl_data.build_dataset(
             recipe,
             out,

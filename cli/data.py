@@ -1,13 +1,12 @@
 """`tcmrl-data`: plan, build, list, inspect, verify, repair and export datasets."""
 
-import sys
 from pathlib import Path
 
 import click
 
 from .building import build, plan
 from .cache import cache
-from .frame import make_table, output_options, print_json, print_table, remark, run, size
+from .frame import main_program, make_table, output_options, print_json, print_table, remark, size
 from .inspection import inspect
 from .progress import StageProgress
 from .status import status
@@ -18,7 +17,7 @@ CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
 def main() -> None:
     """Entry point of the console script."""
-    sys.exit(run(data))
+    main_program(data)
 
 
 @click.group(name="tcmrl-data", context_settings=CONTEXT)

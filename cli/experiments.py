@@ -15,6 +15,7 @@ from .frame import (
     print_json,
     print_table,
     remark,
+    same_command,
     stopped_by_signals,
 )
 
@@ -82,7 +83,7 @@ def experiment(
 
     loaded = load_experiment(name)
     out = out or Path("results") / loaded.name
-    with stopped_by_signals(out):
+    with stopped_by_signals(lambda: same_command(out)):
         report = run_experiment(
             loaded,
             out,

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import click
 
@@ -27,11 +27,38 @@ DONE, INCOMPLETE, BAD_INPUT = 0, 1, 2
 SPANS = ((86_400, "d", 3_600, "h"), (3_600, "h", 60, "min"), (60, "min", 1, "s"))
 """Seconds and name of a unit of time, and of the one shown beside it."""
 
+INTERRUPTED = "interrupted; run the same command again"
+
 PIPE_WIDTH = 250
 """Columns of a table that does not go to a terminal."""
 
 FOLDED_WIDTH = 12
 """Columns that a folded text keeps where the terminal is narrow."""
+
+
+def main_program(command: click.Command) -> NoReturn:
+    """Runs this process's command line and exits; Ctrl-C and SIGTERM are obeyed once, in order.
+
+    Further ones change nothing: they would break off the very work of stopping.
+    """
+    obeyed = False
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        nonlocal obeyed
+        if not obeyed:
+            obeyed = True
+            raise KeyboardInterrupt
+
+    for number in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(number) != signal.SIG_IGN:  # a shell's background work stays there
+            signal.signal(number, interrupt)
+    try:
+        code = run(command)
+    except Exception:
+        if not obeyed:
+            raise
+        code = _fail(INTERRUPTED, INCOMPLETE)  # a library that was broken off may raise anything
+    sys.exit(code)
 
 
 def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
@@ -58,7 +85,7 @@ def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
     except TcmrlError as error:
         return _fail(str(error), BAD_INPUT)
     except click.Abort:
-        return _fail("interrupted; what was finished stays, the same command goes on from there", INCOMPLETE)
+        return _fail(INTERRUPTED, INCOMPLETE)
     except OSError as error:
         return _fail(f"{error.filename or 'a file'}: {error.strerror or error}", BAD_INPUT)
     return result if isinstance(result, int) else DONE
@@ -69,26 +96,30 @@ def fail_incomplete(message: str) -> None:
     click.get_current_context().exit(_fail(message, INCOMPLETE))
 
 
-def typed_command() -> str:
-    """The running command as it was typed, to be run again."""
+def typed_command(*more: str) -> str:
+    """The running command as it was typed, to be run again, with more arguments that it does not have yet."""
     context = click.get_current_context().find_root()
-    return shlex.join([str(context.info_name), *context.obj])
+    return shlex.join(
+        [str(context.info_name), *context.obj, *(each for each in more if each not in context.obj)]
+    )
+
+
+def same_command(out: Path) -> str:
+    """That the command that was typed goes on with what it left in a folder."""
+    return f"{out} keeps what is finished, to go on run `{typed_command()}` again"
 
 
 @contextlib.contextmanager
-def stopped_by_signals(out: Path) -> Iterator[None]:
-    """Lets Ctrl-C and SIGTERM end long work in order, with one line that says how to go on."""
+def stopped_by_signals(go_on: Callable[[], str]) -> Iterator[None]:
+    """Lets Ctrl-C and SIGTERM end long work in order, with one line.
 
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    earlier = signal.signal(signal.SIGTERM, interrupt)
+    Args:
+        go_on: says, once the work has stopped, what is left of it and which command goes on.
+    """
     try:
         yield
     except KeyboardInterrupt:
-        fail_incomplete(f"interrupted; {out} keeps what is finished, to go on run `{typed_command()}` again")
-    finally:
-        signal.signal(signal.SIGTERM, earlier)
+        fail_incomplete(f"interrupted; {go_on()}")
 
 
 def output_options(command: Command) -> Command:

@@ -1,6 +1,5 @@
 """`tcmrl` and its first command: meta-train on a dataset's manifest."""
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal, get_args
@@ -9,12 +8,20 @@ import click
 
 from .evaluation import evaluate
 from .experiments import experiment
-from .frame import duration, output_options, print_json, remark, run
+from .frame import (
+    duration,
+    main_program,
+    output_options,
+    print_json,
+    remark,
+    stopped_by_signals,
+    typed_command,
+)
 from .progress import StageProgress
 from .reports import report
 
 if TYPE_CHECKING:
-    from tcmrl_algo import Progress, TrainingReport
+    from tcmrl_algo import Progress, TrainingConfig, TrainingReport
     from tcmrl_data import Dataset
 
 Profile = Literal["paper", "quick", "reduced"]
@@ -22,7 +29,7 @@ Profile = Literal["paper", "quick", "reduced"]
 
 def main() -> None:
     """Entry point of the console script."""
-    sys.exit(run(tcmrl))
+    main_program(tcmrl)
 
 
 @click.group(name="tcmrl", context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
@@ -99,8 +106,9 @@ def train(
 ) -> None:
     """Meta-train on the training tasks of a dataset, MANIFEST (its folder or manifest.json).
 
-    The dataset carries the training table of its recipe; --set changes single values of it. A killed
-    run goes on with --resume, and ends as if it had never stopped.
+    The dataset carries the training table of its recipe; --set changes single values of it. Ctrl-C and
+    SIGTERM save a checkpoint. A run that was stopped or killed goes on with --resume, and ends as if it had
+    never stopped.
 
     \b
     Examples:
@@ -112,16 +120,17 @@ def train(
     from tcmrl_data import open_dataset, parse_bytes
 
     limit = parse_bytes(memory_limit) if memory_limit else None
-    if resume and (profile is not None or overrides):
-        raise click.UsageError("--resume keeps the run's settings; leave out --profile and --set.")
     dataset = open_dataset(manifest)
-    with StageProgress(quiet=quiet) as progress:
+    config = _config(dataset, algo=algo, profile=profile, overrides=overrides)
+    folder = out or Path("runs") / f"{dataset.name}-{config.settings.run.algorithm}-seed{seed or 0}"
+    with stopped_by_signals(lambda: _how_to_go_on(folder)), StageProgress(quiet=quiet) as progress:
         if resume:
-            folder = out or _run_folder(dataset, algo or _default_algorithm(dataset), seed or 0)
             report = _resume(
                 folder,
                 dataset,
                 algo=algo,
+                profile=profile,
+                overrides=overrides,
                 seed=seed,
                 steps=steps,
                 device=device,
@@ -130,11 +139,10 @@ def train(
             )
         else:
             report = _train(
-                out,
+                folder,
                 dataset,
-                algo=algo,
+                config=config,
                 profile=profile or dataset.manifest.profile,
-                overrides=overrides,
                 seed=seed or 0,
                 steps=steps,
                 device=device or "cpu",
@@ -144,30 +152,37 @@ def train(
     _print_training(report, as_json=as_json, quiet=quiet)
 
 
+def _config(
+    dataset: "Dataset", *, algo: str | None, profile: Profile | None, overrides: Sequence[str]
+) -> "TrainingConfig":
+    from tcmrl_algo import resolve
+
+    chosen = profile or dataset.manifest.profile
+    table = dataset.manifest.training.get(chosen)
+    if table is None:
+        known = ", ".join(dataset.manifest.training)
+        raise click.UsageError(f"{dataset.folder} has no training table {chosen!r}; known are {known}.")
+    place = f"training table of {dataset.name!r}, profile {chosen!r}"
+    return resolve(table, place=place, algorithm=algo, overrides=overrides)
+
+
 def _train(
-    out: Path | None,
+    folder: Path,
     dataset: "Dataset",
     *,
-    algo: str | None,
+    config: "TrainingConfig",
     profile: Profile,
-    overrides: Sequence[str],
     seed: int,
     steps: int | None,
     device: str,
     memory_limit: int | None,
     progress: StageProgress,
 ) -> "TrainingReport":
-    from tcmrl_algo import resolve, train_run
+    from tcmrl_algo import train_run
 
-    table = dataset.manifest.training.get(profile)
-    if table is None:
-        known = ", ".join(dataset.manifest.training)
-        raise click.UsageError(f"{dataset.folder} has no training table {profile!r}; known are {known}.")
-    place = f"training table of {dataset.name!r}, profile {profile!r}"
-    config = resolve(table, place=place, algorithm=algo, overrides=overrides)
     return train_run(
         dataset,
-        out or _run_folder(dataset, config.settings.run.algorithm, seed),
+        folder,
         config=config,
         profile=profile,
         seed=seed,
@@ -184,6 +199,8 @@ def _resume(
     dataset: "Dataset",
     *,
     algo: str | None,
+    profile: Profile | None,
+    overrides: Sequence[str],
     seed: int | None,
     steps: int | None,
     device: str | None,
@@ -195,12 +212,14 @@ def _resume(
     record = open_run(folder).record
     for name, asked, recorded in (
         ("--algo", algo, record.config.settings.run.algorithm),
+        ("--profile", profile, record.profile),
         ("--seed", seed, record.seed),
     ):
         if asked is not None and asked != recorded:
             raise click.UsageError(
                 f"{folder} is a run with {name} {recorded}, not {asked}; leave {name} out."
             )
+    _check_settings(folder, record.config, overrides)
     return resume_run(
         folder,
         dataset,
@@ -212,15 +231,26 @@ def _resume(
     )
 
 
-def _default_algorithm(dataset: "Dataset") -> str:
+def _check_settings(folder: Path, config: "TrainingConfig", overrides: Sequence[str]) -> None:
+    """Refuses `--set` options under which a run was not begun."""
     from tcmrl_algo import resolve
 
-    table = dataset.manifest.training[dataset.manifest.profile]
-    return resolve(table, place=f"training table of {dataset.name!r}").settings.run.algorithm
+    tables = config.settings.model_dump() | {config.settings.run.algorithm: config.method}
+    for text in overrides:
+        if resolve(tables, place=f"--set {text}", overrides=[text]) != config:
+            raise click.UsageError(
+                f"{folder} was not begun with --set {text}; leave it out, or train anew in another --out."
+            )
 
 
-def _run_folder(dataset: "Dataset", algorithm: str, seed: int) -> Path:
-    return Path("runs") / f"{dataset.name}-{algorithm}-seed{seed}"
+def _how_to_go_on(folder: Path) -> str:
+    from tcmrl_algo import open_run
+
+    if not (folder / "run.json").is_file():
+        return f"nothing was trained yet, to start run `{typed_command()}` again"
+    checkpoints = open_run(folder).checkpoints()
+    step = checkpoints[-1].step if checkpoints else 0
+    return f"to go on from step {step:,} run `{typed_command('--resume')}`"
 
 
 def _show(progress: StageProgress, event: "Progress") -> None:

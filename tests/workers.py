@@ -68,13 +68,13 @@ def killer(mark: str, when: Callable[[], object], kills: int) -> Iterator[list[i
 
 
 @contextlib.contextmanager
-def command_line(*arguments: str) -> Iterator["subprocess.Popen[str]"]:
-    """A running `tcmrl-data` in a session of its own, killed at the end if it still runs.
+def command_line(*arguments: str, program: str = "tcmrl-data") -> Iterator["subprocess.Popen[str]"]:
+    """A running `tcmrl-data` or `tcmrl` in a session of its own, killed at the end if it still runs.
 
     It hears Ctrl-C even where the tests themselves run in the background of a shell, which ignores it.
     """
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    code += "; from tcmrl_cli.data import main; main()"
+    code += f"; from tcmrl_cli.{'data' if program == 'tcmrl-data' else 'train'} import main; main()"
     with subprocess.Popen(
         [sys.executable, "-c", code, *arguments],
         cwd=ROOT,

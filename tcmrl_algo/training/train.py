@@ -15,6 +15,7 @@ from tcmrl_algo.methods.problem import Algorithm, MomentsRecord, problem_of
 from tcmrl_algo.training.batches import Batches, open_batches
 from tcmrl_algo.training.checkpoint import Run, RunRecord, digest, open_run, write_run
 from tcmrl_algo.training.config import ALGORITHMS, TrainingConfig, validated
+from tcmrl_algo.training.interruption import DeferredInterrupts
 from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_algo.training.metrics import MetricsWriter
 from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError, plugin
@@ -113,7 +114,9 @@ def train_run(
         >>> train_run(dataset, "runs/first", config=config, profile="quick", seed=1)  # doctest: +SKIP
     """
     if (Path(out) / "run.json").exists():
-        raise CheckpointError(f"{out} holds a run already; go on with --resume, or name another --out")
+        raise CheckpointError(
+            f"{out} holds a run already; add --resume to go on with it, or name another --out"
+        )
     batches = open_batches(
         dataset, config, seed=seed, device=usable_device(device), memory_limit=memory_limit, say=say
     )
@@ -146,6 +149,8 @@ def resume_run(
 ) -> TrainingReport:
     """Goes on from a run's newest checkpoint; ends as an uninterrupted run of the same length would have.
 
+    A run that was killed before its first checkpoint begins anew.
+
     Args:
         out: the run's folder.
         dataset: the one it was trained on.
@@ -153,7 +158,7 @@ def resume_run(
         device: another device.
         memory_limit: as for `train_run`.
         report: called after every logged step.
-        say: as for `train_run`.
+        say: told from which step training goes on; otherwise as for `train_run`.
 
     Raises:
         CheckpointError: no run, another dataset, or already further than `steps`.
@@ -175,6 +180,7 @@ def resume_run(
         say=say,
     )
     algorithm = create_algorithm(record, dataset)
+    say(f"going on from step {start:,}" if start else "no checkpoint was saved: starting at step 0")
     if start:
         algorithm.load_tensors(run.newest().tensors())
     return _train(write_run(run.folder, record), algorithm, batches, start=start, report=report)
@@ -224,12 +230,13 @@ def _train(
     start: int,
     report: Callable[[Progress], None],
 ) -> TrainingReport:
-    """The loop: batch n - 1 makes step n."""
+    """The loop: batch n - 1 makes step n; Ctrl-C and SIGTERM take effect after a checkpoint of their step."""
     settings, last = run.record.config.settings.run, run.record.steps
     keep_freed_memory()
     began = time.perf_counter()
     logged_at, logged_step, logged_wait = began, start, 0.0
     with (
+        DeferredInterrupts() as interrupts,
         MetricsWriter(run.folder, step=start) as writer,
         Prefetch(batches.batch, range(start, last), depth=PREFETCHED) as stream,
     ):
@@ -246,9 +253,12 @@ def _train(
                 times = {"time/steps_per_second": rate, "time/data_share": share}
                 writer.write(step, values | about | times)
                 report(Progress(step, last, rate, share, values))
-            if step % settings.checkpoint_every == 0 or step == last:
+            stopping = interrupts.received
+            if step % settings.checkpoint_every == 0 or step == last or stopping:
                 _check_finite(algorithm.tensors(), step)
                 run.save(step, algorithm.tensors())
+            if stopping:
+                break  # the signal takes effect as the block ends
     return TrainingReport(run, last, time.perf_counter() - began, digest(algorithm.tensors()))
 
 
