@@ -637,6 +637,7 @@ LAYOUTS = [
     Case("chunk names", _zarr(chunk_key_encoding={"name": "v2"}), "rewards/zarr.json", "chunk_key_encoding"),
     Case("attributes", _zarr(attributes={ESCAPE: 1}), "rewards/zarr.json", "attributes"),
     Case("fill value", _zarr(fill_value="0x7fc00000"), "rewards/zarr.json", "fill_value"),
+    Case("axes of another array", _zarr(dimension_names=["episode"]), "rewards/zarr.json", "dimension_names"),
     Case("unknown field", _zarr(must_understand=True), "rewards/zarr.json", "must_understand"),
     Case(
         "metadata NaN", lambda f: f.write("rewards/zarr.json", b'{"shape":NaN}'), "rewards/zarr.json", "NaN"

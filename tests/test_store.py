@@ -74,6 +74,9 @@ def test_tensorstore_reads_the_same_bytes(tiny: Dataset) -> None:
         ("chunk_grid", {"name": "regular", "configuration": {"chunk_shape": [0, 2]}}),
         ("chunk_key_encoding", {"name": "v2"}),
         ("storage_transformers", [{"name": "x"}]),
+        ("dimension_names", None),
+        ("dimension_names", ["step"]),
+        ("dimension_names", ["step", "observation"]),
         ("surprise", 1),
     ],
 )
@@ -84,6 +87,41 @@ def test_metadata_outside_the_allow_list_is_refused(tmp_path: Path, field: str, 
     file.write_text(json.dumps(json.loads(file.read_text()) | {field: value}))
     with pytest.raises(StoreError, match=field):
         read_arrays(tmp_path / "part", ["actions"])
+
+
+def test_every_array_names_its_axes(tiny: Dataset) -> None:
+    folder = tiny.folder_of(0, 150)
+    names = {
+        name: json.loads((folder / name / "zarr.json").read_text())["dimension_names"]
+        for name in tiny.arrays(0, 150)
+    }
+    assert names == {
+        "observations": ["observation_row", "observation"],
+        "actions": ["step", "action"],
+        "rewards": ["step"],
+        "terminated": ["step"],
+        "truncated": ["step"],
+        "episode_offsets": ["episode_boundary"],
+    }
+
+
+def test_xarray_opens_a_part_of_episodes_of_several_lengths(tmp_path: Path) -> None:
+    xarray = pytest.importorskip("xarray", reason="xarray is not installed; pip install xarray")
+    flags = [np.zeros(length, dtype=bool) for length in (2, 3)]
+    episodes = [
+        Trajectory(np.ones((len(each) + 1, 4)), np.ones((len(each), 2)), np.ones(len(each)), each, each)
+        for each in flags
+    ]
+    write_tree(tmp_path / "part", encode_arrays(pack(episodes)))
+    opened = xarray.open_zarr(tmp_path / "part", consolidated=False, zarr_format=3)
+    assert dict(opened.sizes) == {
+        "observation_row": 7,
+        "observation": 4,
+        "step": 5,
+        "action": 2,
+        "episode_boundary": 3,
+    }
+    assert opened["rewards"].sum() == 5
 
 
 def test_the_whole_dataset_is_one_zarr_hierarchy(tiny: Dataset) -> None:

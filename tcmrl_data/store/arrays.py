@@ -17,7 +17,7 @@ from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
-from tcmrl_data.store.layout import ArrayLayout, check_expansion, chunk_problem, read_layout
+from tcmrl_data.store.layout import ArrayLayout, check_expansion, chunk_problem, dimension_names, read_layout
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -102,6 +102,7 @@ def encode_arrays(arrays: Arrays) -> dict[str, bytes]:
             serializer=BytesCodec(),
             compressors=[ZstdCodec(level=3), Crc32cCodec()],
             fill_value=np.nan if array.dtype.kind == "f" else array.dtype.type(0),
+            dimension_names=dimension_names(name),
             config={"write_empty_chunks": True},
         )
     return {name: buffer.to_bytes() for name, buffer in files.items()}

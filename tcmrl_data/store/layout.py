@@ -28,6 +28,13 @@ GROUP = canonical_json({"zarr_format": 3, "node_type": "group", "attributes": {}
 ITEM_BYTES = {"float32": 4, "int64": 8, "bool": 1}
 FILL_VALUES = {"float32": "NaN", "int64": 0, "bool": False}
 
+DIMENSIONS = {
+    "observations": ("observation_row", "observation"),
+    "actions": ("step", "action"),
+    "episode_offsets": ("episode_boundary",),
+}
+"""Axes of the arrays that are not one value per step; an episode has one observation row more than steps."""
+
 _CODECS = (
     {"name": "bytes", "configuration": {"endian": "little"}},
     {"name": "zstd", "configuration": {"level": 3, "checksum": False}},
@@ -35,6 +42,11 @@ _CODECS = (
 )
 _ONE_BYTE_CODECS = ({"name": "bytes"}, *_CODECS[1:])
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+
+
+def dimension_names(name: str) -> tuple[str, ...]:
+    """The names of an array's axes, by which xarray lines up the arrays of a part."""
+    return DIMENSIONS.get(name, ("step",))
 
 
 @dataclass(frozen=True)
@@ -119,6 +131,11 @@ def read_layout(folder: Path, name: str) -> ArrayLayout:
     if blocked:
         raise StoreError(f"{folder / name / 'zarr.json'} is missing: {blocked[0]} {blocked[1]}")
     metadata = _read_metadata(_ArrayMetadata, folder / name / "zarr.json")
+    if metadata.dimension_names != dimension_names(name):
+        raise StoreError(
+            f"{folder / name / 'zarr.json'}: dimension_names {str(metadata.dimension_names)[:200]} are not "
+            f"{dimension_names(name)}, those of {name}"
+        )
     layout = ArrayLayout(name, metadata.data_type, metadata.shape, metadata.chunks)
     if prod(layout.grid) > MAX_CHUNKS:
         raise StoreError(
@@ -201,6 +218,7 @@ class _ArrayMetadata(_Metadata):
     chunk_key_encoding: dict[str, Any]
     codecs: tuple[dict[str, Any], ...]
     fill_value: str | float | bool
+    dimension_names: tuple[str, ...]
     storage_transformers: tuple[Any, ...] = Field(default=(), max_length=0)
 
     @property
@@ -209,6 +227,8 @@ class _ArrayMetadata(_Metadata):
 
     @model_validator(mode="after")
     def _as_written_here(self) -> "_ArrayMetadata":
+        if len(self.dimension_names) != len(self.shape):
+            raise ValueError(f"shape {self.shape} has not one axis per name in dimension_names")
         if len(self.chunks) != len(self.shape) or any(
             chunk > max(1, size) for chunk, size in zip(self.chunks, self.shape, strict=True)
         ):
