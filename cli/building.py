@@ -19,6 +19,7 @@ from .frame import (
     size,
     stopped_by_signals,
 )
+from .plugins import BEHAVIOR, ENGINE
 from .progress import StageProgress
 
 if TYPE_CHECKING:
@@ -40,8 +41,8 @@ def recipe_options(command: Command) -> Command:
         ),
         click.option(
             "--behavior",
-            metavar="SOURCE",
-            help="Where the policies come from: stacked, sac or scripted; the recipe's choice if left out.",
+            type=BEHAVIOR,
+            help="Where the policies come from; the recipe's choice if left out.",
         ),
         click.option(
             "--tasks",
@@ -62,8 +63,8 @@ def recipe_options(command: Command) -> Command:
             "--engine",
             default="local",
             show_default=True,
-            metavar="NAME",
-            help="Where the work runs: local, or ray (needs tcmrl[ray]).",
+            type=ENGINE,
+            help="Where the work runs; ray needs tcmrl[ray].",
         ),
         output_options,
     )
@@ -98,7 +99,6 @@ def plan(
 
     recipe = _load(environment, profile, behavior, overrides)
     chosen = _parse_tasks(recipe, tasks)
-    tcmrl_data.ENGINES.get(engine)
     remark("measuring this machine for a few seconds …", quiet=quiet or as_json)
     planned = tcmrl_data.plan_build(recipe, tasks=chosen, workers=workers)
     if as_json:

@@ -1,5 +1,6 @@
 """`tcmrl-data`: plan, build, list, inspect, verify, repair and export datasets."""
 
+import dataclasses
 from pathlib import Path
 
 import click
@@ -8,6 +9,7 @@ from .building import build, plan
 from .cache import cache
 from .frame import main_program, make_table, output_options, print_json, print_table, remark, size
 from .inspection import inspect
+from .plugins import FORMAT
 from .progress import StageProgress
 from .status import status
 from .verification import gc, import_policy, repair, verify
@@ -42,7 +44,7 @@ for _command in (plan, build, status, inspect, verify, repair, gc, import_policy
 @data.command()
 @output_options
 def envs(as_json: bool, quiet: bool) -> None:
-    """List the environments that have a recipe.
+    """List the environments that have a recipe, and those that are broken.
 
     \b
     Example:
@@ -50,9 +52,9 @@ def envs(as_json: bool, quiet: bool) -> None:
     """
     import tcmrl_data
 
-    rows = tcmrl_data.list_environments()
+    found = tcmrl_data.list_environments()
     if as_json:
-        print_json({"environments": rows})
+        print_json(dataclasses.asdict(found))
         return
     heads = {
         "name": "environment",
@@ -64,9 +66,11 @@ def envs(as_json: bool, quiet: bool) -> None:
         "test": "test",
     }
     table = make_table("Environments", columns=heads.values(), text=["environment"])
-    for row in rows:
+    for row in found.environments:
         table.add_row(*(str(row[key]) for key in heads))
     print_table(table)
+    for error in found.broken.values():
+        click.echo(f"broken: {error}")
 
 
 @data.command(name="list")
@@ -110,7 +114,7 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
 
 @data.command()
 @click.argument("dataset", type=click.Path(path_type=Path))
-@click.option("--format", "format_name", required=True, metavar="NAME", help="The format: hdf5 or minari.")
+@click.option("--format", "format_name", required=True, type=FORMAT, help="The format.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),

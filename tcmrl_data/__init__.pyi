@@ -39,11 +39,11 @@ from .foundation.seeding import Purpose as Purpose
 from .foundation.seeding import keyed_generator as keyed_generator
 from .foundation.seeding import keyed_seed as keyed_seed
 from .interchange.formats.base import FORMATS as FORMATS
+from .recipe.listing import list_environments as list_environments
 from .recipe.recipe import PROFILES as PROFILES
 from .recipe.recipe import Recipe as Recipe
 from .recipe.recipe import apply_overrides as apply_overrides
 from .recipe.recipe import first_problem as first_problem
-from .recipe.recipe import list_environments as list_environments
 from .recipe.recipe import load_recipe as load_recipe
 from .recipe.tasks import parse_indices as parse_indices
 from .sampling.batch import Batch as Batch

@@ -1,14 +1,19 @@
 """Plug-ins that other packages declare: found by entry points, imported one at a time, broken ones named."""
 
+import json
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tcmrl_cli.data import data
 
+from tcmrl_data import list_environments, load_recipe
+from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import PluginError, UnknownNameError
 from tcmrl_data.foundation.plugins import Registry
+from tests.commands import assert_refused, in_process
 from tests.plugin_packages import install
 
 GROUP = "tcmrl_test.animals"
@@ -137,3 +142,119 @@ def test_looking_one_up_imports_no_other_and_listing_imports_none(tmp_path: Path
         "assert {'imports_cat', 'imports_dog'} & set(sys.modules) == {'imports_cat'}\n"
     )
     subprocess.run([sys.executable, "-c", script], check=True)
+
+
+POLE = """
+from pathlib import Path
+from typing import final
+from tcmrl_data.envs.base import Environment
+
+
+@final
+class Pole(Environment):
+    name = "pole"
+    observation_dim = 4
+    action_dim = 1
+
+    @classmethod
+    def members(cls):
+        return ["pole/short", "pole/long"]
+
+    @classmethod
+    def recipe_file(cls, name):
+        return Path(__file__).with_name("pole.toml")
+
+    def draw_parameters(self, num_tasks, task_seed):
+        return [{"length": 0.5 + index} for index in range(num_tasks)]
+
+    def make(self, parameters, *, view="stored", reward="stored"):
+        raise NotImplementedError
+"""
+ENVIRONMENT_GROUP = "tcmrl.environments"
+
+
+@pytest.fixture
+def pole_recipe() -> str:
+    """The recipe of point-robot, for another environment."""
+    file = ENVIRONMENTS.get("point-robot").recipe_file("point-robot")
+    return file.read_text(encoding="utf-8").replace('name = "point-robot"', 'name = "pole"')
+
+
+@pytest.fixture
+def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder of installed packages with an environment family, and one that raises."""
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for module in ("users_pole", "users_broken"):
+        monkeypatch.delitem(sys.modules, module, raising=False)
+    modules = {"users_pole": POLE, "users_broken": "raise RuntimeError('out of order')"}
+    lines = "pole = users_pole:Pole\nrusty = users_broken:Rusty"
+    install(tmp_path, "users-package", modules=modules, declares={ENVIRONMENT_GROUP: lines})
+    return tmp_path
+
+
+def test_an_environment_of_another_package_brings_its_recipe(site: Path, pole_recipe: str) -> None:
+    (site / "pole.toml").write_text(pole_recipe)
+    recipe = load_recipe("pole/long", profile="quick")
+    assert recipe.make_environment().name == "pole/long"
+    with pytest.raises(UnknownNameError, match="unknown environment 'pole/lang'; did you mean pole/long"):
+        load_recipe("pole/lang")
+    with pytest.raises(UnknownNameError, match="unknown environment 'pole'; did you mean pole/"):
+        load_recipe("pole")
+
+
+def test_envs_lists_broken_environments_with_their_errors_beside_all_others(
+    site: Path, pole_recipe: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    ours = [row["name"] for row in list_environments().environments]
+    (site / "pole.toml").write_text(pole_recipe)
+    call = in_process(data, capsys)
+    code, output, _ = call("envs", "--json")
+    listed = json.loads(output)
+    assert (code, list(listed["broken"])) == (0, ["rusty"])
+    assert "package 'users-package' is broken: RuntimeError: out of order" in listed["broken"]["rusty"]
+    assert [row["name"] for row in listed["environments"]] == sorted([*ours, "pole/long", "pole/short"])
+    code, output, _ = call("envs")
+    assert (code, output.count("broken: environment 'rusty' of package")) == (0, 1)
+    assert_refused(call("plan", "rusty"), "environment 'rusty' of package 'users-package' is broken")
+
+
+def test_an_environment_whose_recipe_does_not_load_is_listed_as_broken(site: Path) -> None:
+    (site / "pole.toml").write_text("schema = 99")
+    broken = list_environments().broken
+    assert list(broken) == ["rusty", "pole/long", "pole/short"]
+    assert "schema 99 is not 1" in broken["pole/long"]
+
+
+def test_a_family_with_members_of_another_name_is_broken(site: Path) -> None:
+    (site / "users_pole.py").write_text(POLE.replace("pole/short", "point-robot"))
+    assert "has the member 'point-robot' outside 'pole'" in ENVIRONMENTS.broken()["pole"]
+    assert ENVIRONMENTS.get("point-robot").name == "point-robot"
+
+
+def test_help_names_the_plugins_of_other_packages_and_imports_none(tmp_path: Path) -> None:
+    modules = {"users_engine": "raise RuntimeError('imported')"}
+    declares = {"tcmrl.engines": "cloud = users_engine:Cloud"}
+    install(tmp_path, "users-package", modules=modules, declares=declares)
+    script = (
+        f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
+        "from tcmrl_cli.data import data\n"
+        "from tcmrl_cli.frame import run\n"
+        "assert run(data, ['build', '--help']) == 0\n"
+        "assert not {'numpy', 'gymnasium', 'pydantic', 'users_engine'} & set(sys.modules)\n"
+    )
+    shown = subprocess.run([sys.executable, "-c", script], check=True, capture_output=True, text=True)
+    assert "--engine [cloud|local|ray]" in shown.stdout
+
+
+@pytest.mark.parametrize(
+    ("option", "error"),
+    [
+        (["build", "point-robot", "--engine", "rya"], "unknown engine 'rya'; did you mean ray"),
+        (["build", "point-robot", "--behavior", "sack"], "unknown behavior source 'sack'; did you mean sac"),
+        (["export", "nowhere", "--format", "hdf"], "unknown format 'hdf'; did you mean hdf5"),
+    ],
+)
+def test_an_option_refuses_a_name_that_nobody_declares(
+    option: list[str], error: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert_refused(in_process(data, capsys)(*option), error)

@@ -2,19 +2,21 @@ from itertools import pairwise
 
 import pytest
 
-from tcmrl_data import apply_overrides, load_recipe
+from tcmrl_data import apply_overrides, list_environments, load_recipe
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
-from tcmrl_data.recipe.recipe import PROFILES, recipe_names
+from tcmrl_data.recipe.recipe import PROFILES
 from tcmrl_data.recipe.tasks import choose_tasks
+from tests.environments import some_members
 
 
 def test_every_environment_has_a_recipe() -> None:
-    assert recipe_names() == ENVIRONMENTS.members()
+    assert [row["name"] for row in list_environments().environments] == ENVIRONMENTS.members()
+    assert list_environments().broken == {}
 
 
 @pytest.mark.parametrize(
-    "name", [n for n in recipe_names() if not n.startswith("ml1/")] + ["ml1/reach", "ml1/sweep"]
+    "name", [name for family in ENVIRONMENTS.working().values() for name in some_members(family)]
 )
 def test_profiles_resolve(name: str) -> None:
     profiles = list(load_recipe(name).training)
@@ -34,7 +36,7 @@ def test_profiles_resolve(name: str) -> None:
 def test_sizes_are_the_papers() -> None:
     sizes = {
         name: (environment["tasks"], environment["train"])
-        for name in recipe_names()
+        for name in ENVIRONMENTS.members()
         for environment in [load_recipe(name).environment]
     }
     assert sizes["point-robot-wind"] == sizes["ml1/reach"] == (50, 40)

@@ -208,6 +208,11 @@ class EnvironmentRegistry(Registry[Environment]):
             raise unknown_name(self.noun, name, family.members())
         return family
 
+    def defect(self, found: Any, name: str) -> str | None:
+        defect = super().defect(found, name)
+        strangers = [] if defect else [each for each in found.members() if each.partition("/")[0] != name]
+        return f"has the member {strangers[0]!r} outside {name!r}" if strangers else defect
+
     def members(self) -> list[str]:
         """The environments of all plug-ins that are not broken, sorted; imports the plug-ins."""
         return sorted(name for family in self.working().values() for name in family.members())

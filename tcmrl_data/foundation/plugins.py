@@ -53,12 +53,16 @@ class Registry(Generic[Kind]):
             packages = " and ".join(sorted(_package(declared) for declared in entries[name]))
             raise PluginError(f"{self.noun} {name!r} is declared by {packages}; uninstall one of them")
         problem = f"{self.noun} {name!r} of package {_package(entry)} is broken"
+        remedy = "repair or uninstall the package"
         try:
             found = entry.load()
+            defect = self.defect(found, name)
         except (Exception, SystemExit) as error:  # importing a module may raise anything
-            raise PluginError(f"{problem}: {_one_line(error)}; repair or uninstall the package") from error
-        if defect := self._defect(found, name):
-            raise PluginError(f"{problem}: {entry.value} {defect}; repair or uninstall the package")
+            raise PluginError(
+                f"{problem}: {one_line_error(error)}; repair or uninstall the package"
+            ) from error
+        if defect:
+            raise PluginError(f"{problem}: {entry.value} {defect}; {remedy}")
         plugin: type[Kind] = found
         return plugin
 
@@ -85,8 +89,8 @@ class Registry(Generic[Kind]):
             found.setdefault(entry.name, []).append(entry)
         return found
 
-    def _defect(self, found: object, name: str) -> str | None:
-        """Why a loaded object cannot be used, or None where it can."""
+    def defect(self, found: object, name: str) -> str | None:
+        """Why an imported object cannot be a plug-in of a name, or None where it can."""
         if not (isinstance(found, type) and issubclass(found, self.base)):
             return f"is no subclass of {self.base.__module__}.{self.base.__qualname__}"
         if inspect.isabstract(found):
@@ -111,7 +115,8 @@ def _package(entry: EntryPoint) -> str:
     return repr(entry.dist.name if entry.dist else "unknown")
 
 
-def _one_line(error: BaseException) -> str:
+def one_line_error(error: BaseException) -> str:
+    """Kind and message of what a plug-in raised."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 

@@ -106,31 +106,6 @@ class _Behavior(_Table):
     reward: Literal["stored", "dense"] = "stored"
 
 
-def recipe_names() -> list[str]:
-    """Every environment that has a recipe."""
-    return [name for name in ENVIRONMENTS.members() if _recipe_file(name).is_file()]
-
-
-def list_environments() -> list[dict[str, Any]]:
-    """Name, dimensions, horizon and task counts of every environment that has a recipe."""
-    rows = []
-    for name in recipe_names():
-        environment = load_recipe(name).make_environment()
-        settings = environment.settings
-        rows.append(
-            {
-                "name": name,
-                "observation_dim": environment.observation_dim,
-                "action_dim": environment.action_dim,
-                "horizon": settings.horizon,
-                "tasks": settings.tasks,
-                "train": settings.train,
-                "test": settings.tasks - settings.train,
-            }
-        )
-    return rows
-
-
 def load_recipe(
     name: str, *, profile: Profile = "paper", overrides: Sequence[str] = (), behavior: str | None = None
 ) -> Recipe:
