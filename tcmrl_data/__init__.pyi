@@ -13,8 +13,6 @@ from .dataset.listing import list_datasets as list_datasets
 from .dataset.returns import return_table as return_table
 from .dataset.selection import Selection as Selection
 from .engine.base import ENGINES as ENGINES
-from .engine.base import Unit as Unit
-from .engine.worker import serve as serve
 from .envs.base import ENVIRONMENTS as ENVIRONMENTS
 from .envs.base import Environment as Environment
 from .envs.base import Lanes as Lanes
@@ -43,7 +41,6 @@ from .recipe.listing import list_environments as list_environments
 from .recipe.recipe import PROFILES as PROFILES
 from .recipe.recipe import Recipe as Recipe
 from .recipe.recipe import apply_overrides as apply_overrides
-from .recipe.recipe import first_problem as first_problem
 from .recipe.recipe import load_recipe as load_recipe
 from .recipe.tasks import parse_indices as parse_indices
 from .sampling.batch import Batch as Batch

@@ -16,6 +16,7 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
+from tcmrl_data.build.driver import WORKER
 from tcmrl_data.build.unit import UnitSpec
 from tcmrl_data.engine import _attempt
 from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit
@@ -69,7 +70,7 @@ def make_units(recipe: Recipe, out: Path, tasks: list[int]) -> list[Unit]:
     for task in choose_tasks(recipe, tasks):
         (out / part_folder(task.index, 0)).parent.mkdir(parents=True)
         spec = UnitSpec(out.resolve(), recipe, 0, (task,))
-        units.append(Unit(f"task {task.index}", spec.to_json()))
+        units.append(Unit(f"task {task.index}", spec.to_json(), WORKER))
     return units
 
 
@@ -238,7 +239,7 @@ def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
 def test_a_worker_ends_with_its_driver(tiny_recipe: Recipe, tmp_path: Path) -> None:
     """That is, when its input closes, long before it has anything to say."""
     (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
-    command = [sys.executable, "-m", "tcmrl_data.engine.worker"]
+    command = [sys.executable, "-m", WORKER]
     worker = subprocess.run(
         command, cwd=ROOT, text=True, input=json.dumps(unit.spec) + "\n", capture_output=True, check=False
     )
@@ -250,7 +251,7 @@ def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_do
     tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
 ) -> None:
     (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
-    command = [sys.executable, "-m", "tcmrl_data.engine.worker"]
+    command = [sys.executable, "-m", WORKER]
     with subprocess.Popen(
         command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as worker:
@@ -283,7 +284,7 @@ def test_a_worker_that_ends_before_it_has_read_its_spec_is_a_crash(
 
     monkeypatch.setattr(_attempt, "_start_worker", start_and_outlive)
     monkeypatch.setattr(sys, "executable", program)
-    (result,) = run(EngineCase("local", None, ""), [Unit("task 3", {})]).values()
+    (result,) = run(EngineCase("local", None, ""), [Unit("task 3", {}, WORKER)]).values()
     assert (result.ok, result.attempt) == (False, 2)
     assert error in str(result.error)
 

@@ -20,8 +20,8 @@ from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.driver import Finished
 from tcmrl_algo.experiment.plan import resolve_method
 from tcmrl_algo.experiment.results import RunResult
-from tcmrl_algo.training.records import read_record
 from tcmrl_data import TcmrlError, TrainingError
+from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
 from tests.workers import ROOT, marked_pids, wait_for

@@ -127,10 +127,10 @@ def test_without_an_address_a_cluster_is_started_for_the_build_and_ended_with_it
 def test_an_address_where_nobody_answers_is_refused_at_once(address: str) -> None:
     pytest.importorskip("ray")
     with pytest.raises(BuildError, match=f"no connection to a Ray cluster at {address}: .*ray start --head"):
-        next(Engine(address=address).run([Unit("task 3", {})], lambda unit, message: None))
+        next(Engine(address=address).run([Unit("task 3", {}, "nothing")], lambda unit, message: None))
 
 
 def test_without_the_package_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(BuildError, match=re.escape("pip install 'tcmrl[ray]'")):
-        next(Engine().run([Unit("task 3", {})], lambda unit, message: None))
+        next(Engine().run([Unit("task 3", {}, "nothing")], lambda unit, message: None))

@@ -55,7 +55,7 @@ def test_quick_point_robot_has_sixteen_training_and_four_test_tasks_over_the_hal
 @pytest.mark.parametrize(
     ("override", "pattern"),
     [
-        ("behavior.sac.stepz=1", r"\[behavior.stacked\]: stepz: Extra inputs are not permitted"),
+        ("behavior.sac.stepz=1", r"unknown key behavior\.stacked\.stepz; did you mean steps"),
         ("behavior.sac.steps='many'", r"steps: Input should be a valid integer, got 'many'"),
         ("behavior.sac.gamma=1.5", "gamma: Input should be less than 1"),
         ("behavior.sac.snapshots=[0,100,3000]", "within the warm-up of 250 random steps"),
@@ -66,7 +66,7 @@ def test_quick_point_robot_has_sixteen_training_and_four_test_tasks_over_the_hal
         ("nonsense.key=1", "unknown table 'nonsense'"),
         ("rollouts.episodes", "expected section.key=value"),
         ("rollouts.episodes.x=1", "is a value, not a section"),
-        ("behavior.colour=1", "colour: Extra inputs"),
+        ("behavior.colour=1", "unknown key behavior.colour; known are observation, reward, source"),
     ],
 )
 def test_bad_overrides_say_what_and_where(override: str, pattern: str) -> None:

@@ -23,8 +23,8 @@ from tcmrl_algo.reporting.figures import draw_embeddings
 from tcmrl_algo.reporting.sections import attention_table, final_table, published, published_table
 from tcmrl_algo.reporting.sources import FinishedRun, labels_of, read_sources
 from tcmrl_algo.reporting.tables import Table, across_seeds
-from tcmrl_algo.training.records import read_record
 from tcmrl_data import Dataset
+from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
 

@@ -189,10 +189,11 @@ def test_metrics_are_logged_as_lines_and_to_tensorboard(start: Train) -> None:
 
 def test_only_the_newest_checkpoints_stay(start: Train, tiny: Dataset) -> None:
     run = start("run", steps=30).run
-    (run.folder / "checkpoints" / ".staging-killed").mkdir()
+    (run.folder / ".staging" / "step_000000055.killed").mkdir()
     resume_run(run.folder, tiny, steps=80)
     found = run.checkpoints()
     assert len(list((run.folder / "checkpoints").iterdir())) == 2
+    assert list((run.folder / ".staging").iterdir()) == []
     assert [each.step for each in found] == [75, 80]
     assert sorted(each.name for each in found[0].folder.iterdir()) == [
         "checkpoint.json",

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 
 def worker_pids(mark: str) -> list[int]:
     """Live worker processes that inherited a mark in their environment."""
-    return [pid for pid in marked_pids(mark) if b"tcmrl_data.engine.worker" in _read(pid, "cmdline")]
+    return [pid for pid in marked_pids(mark) if b"tcmrl_data.build.worker" in _read(pid, "cmdline")]
 
 
 def marked_pids(mark: str) -> list[int]:

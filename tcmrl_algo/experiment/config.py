@@ -12,8 +12,8 @@ from typing import Any, Literal, get_args
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_algo.settings.run import Protocol
-from tcmrl_algo.training.config import validated
 from tcmrl_data import TrainingError
+from tcmrl_data.foundation.validation import validate_table
 
 Metric = Literal[
     "final",
@@ -158,7 +158,7 @@ def read_experiment(tables: Mapping[str, Any], *, place: str) -> Experiment:
     Raises:
         TrainingError: names the first problem and the place.
     """
-    return validated(Experiment, tables, place)
+    return validate_table(Experiment, tables, place=place, error=TrainingError)
 
 
 def experiment_names() -> list[str]:

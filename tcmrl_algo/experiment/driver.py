@@ -1,7 +1,6 @@
 """Runs an experiment: plans it whole, skips what is done, goes on with what was killed, keeps one table."""
 
 import contextlib
-import fcntl
 import os
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -13,9 +12,11 @@ from tcmrl_algo.experiment.job import Job
 from tcmrl_algo.experiment.plan import PlannedRun, check_same, plan_runs
 from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file, table_text
 from tcmrl_algo.training.config import TrainingConfig
-from tcmrl_algo.training.records import read_record, write_file, write_record
 from tcmrl_algo.training.train import usable_device
-from tcmrl_data import ENGINES, CheckpointError, TrainingError, Unit
+from tcmrl_data import TrainingError
+from tcmrl_data.engine.base import ENGINES, Unit
+from tcmrl_data.foundation.disk import lock_file, make_folders, replace_file
+from tcmrl_data.foundation.records import read_record, write_record
 
 WORKER = "tcmrl_algo.experiment.job"
 
@@ -110,12 +111,11 @@ def run_experiment(
         for run in plan
         if found[run.id] is None
     }
-    out.mkdir(parents=True, exist_ok=True)
+    make_folders(out)
     failed: list[str] = []
-    with _lock(out):
+    with lock_file(out / ".lock", f"experiment {out}"):
         write_record(out / "experiment.json", experiment)
         for job in jobs.values():
-            Path(job.folder).mkdir(parents=True, exist_ok=True)
             write_record(Path(job.folder) / "job.json", job)
             error_file(Path(job.folder)).unlink(missing_ok=True)
         present = len(plan) - len(jobs)
@@ -126,7 +126,7 @@ def run_experiment(
             found[name] = result
             if error:
                 failed.append(f"{name}: {error}")
-                write_file(error_file(folder), f"{error}\n".encode())
+                replace_file(error_file(folder), f"{error}\n".encode())
             _write_table(out, experiment)
             ended = sum(each is not None for each in found.values()) + len(failed)
             pace = (time.perf_counter() - began) / (ended - present)
@@ -211,17 +211,6 @@ def _run(jobs: dict[str, Job], workers: int) -> Iterator[tuple[str, str | None]]
             yield result.id, None if result.ok else result.error
 
 
-@contextlib.contextmanager
-def _lock(out: Path) -> Iterator[None]:
-    """Keeps a second driver out of the results folder; the lock ends with this process."""
-    with (out / ".lock").open("a") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise CheckpointError(f"another process runs an experiment in {out}; wait for its end") from None
-        yield
-
-
 def _write_table(out: Path, experiment: Experiment) -> None:
     rows = [row for result in read_results(out, experiment) for row in result.rows()]
-    write_file(out / "table.csv", table_text(rows).encode())
+    replace_file(out / "table.csv", table_text(rows).encode())

@@ -6,7 +6,7 @@ killed one goes on from the newest checkpoint and ends in the same tensors.
 
 import importlib.metadata
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,11 @@ from tcmrl_algo.experiment.results import CurvePoint, RunResult, result_file
 from tcmrl_algo.settings.run import Protocol
 from tcmrl_algo.training.checkpoint import digest, open_run
 from tcmrl_algo.training.config import TrainingConfig
-from tcmrl_algo.training.records import read_record, write_record
 from tcmrl_algo.training.train import Progress, resume_run, train_run
-from tcmrl_data import CheckpointError, Dataset, open_dataset, serve
+from tcmrl_data import CheckpointError, Dataset, open_dataset
+from tcmrl_data.engine.worker import Report, serve
+from tcmrl_data.foundation.records import read_record, write_record
 
-Report = Callable[[Mapping[str, Any]], None]
 MEANS = ("final", "regret", "normalized", "shuffled")
 
 

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.experiment.config import Experiment
 from tcmrl_algo.training.config import TrainingConfig
-from tcmrl_algo.training.records import read_record
+from tcmrl_data.foundation.records import read_record
 
 COLUMNS = (
     "environment",

@@ -14,8 +14,8 @@ from tcmrl_algo.reporting.claims import Verdict, judge, measure_result
 from tcmrl_algo.reporting.contexts import Trained, TrainedContexts, TransitionWeights, embed
 from tcmrl_algo.reporting.sources import FinishedRun, Source, read_sources
 from tcmrl_algo.reporting.tables import Table
-from tcmrl_algo.training.records import write_file
 from tcmrl_data import TcmrlError
+from tcmrl_data.foundation.disk import replace_file
 
 Progress = Callable[[str, int, int], None]
 
@@ -83,7 +83,7 @@ class Page:
     def data(self, table: Table) -> None:
         """Adds the CSV file of a table that is too long to read."""
         self.files.append(self.out / f"{table.name}.csv")
-        write_file(self.files[-1], table.csv().encode())
+        replace_file(self.files[-1], table.csv().encode())
 
     def figure(self, name: str, caption: str) -> Path:
         """Adds a figure; the file is the caller's to draw."""
@@ -127,7 +127,7 @@ def write_report(paths: Sequence[str | Path], out: str | Path, *, report: Progre
         head.text(CLAIMS)
         head.table(sections.claims_table("claims", judged))
     file = page.out / "report.md"
-    write_file(file, ("\n\n".join([*head.lines, *page.lines]) + "\n").encode())
+    replace_file(file, ("\n\n".join([*head.lines, *page.lines]) + "\n").encode())
     return Report(file, (file, *head.files, *page.files), verdicts)
 
 

@@ -1,8 +1,6 @@
 """Runs on disk: `run.json`, and checkpoints of safetensors and JSON that appear whole or not at all."""
 
 import hashlib
-import shutil
-import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +13,10 @@ from torch import Tensor
 
 from tcmrl_algo.methods.problem import MomentsRecord
 from tcmrl_algo.training.config import TrainingConfig
-from tcmrl_algo.training.records import read_record, sync_folder, write_file, write_record
 from tcmrl_data import CheckpointError, Dataset
+from tcmrl_data.foundation.canonical import sha256
+from tcmrl_data.foundation.disk import make_folders, publish_folder, remove_abandoned, remove_tree
+from tcmrl_data.foundation.records import read_record, record_bytes, write_record
 
 KEPT = 2
 """Newest checkpoints kept: the last one, and one to fall back on."""
@@ -90,7 +90,7 @@ class Checkpoint:
         file = self.folder / "tensors.safetensors"
         try:
             content = file.read_bytes()
-            if hashlib.sha256(content).hexdigest() != record.sha256:
+            if sha256(content) != record.sha256:
                 raise CheckpointError(f"{file} is damaged; delete {self.folder} to fall back on an older one")
             return safetensors.torch.load(content)
         except (OSError, SafetensorError) as error:
@@ -128,21 +128,16 @@ class Run:
 
     def save(self, step: int, tensors: Mapping[str, Tensor]) -> None:
         """Publishes a checkpoint by one rename, then removes what is old or was never finished."""
-        folder = self.folder / "checkpoints"
-        staging = folder / f".staging-{uuid.uuid4().hex}"
-        staging.mkdir(parents=True)
         content = safetensors.torch.save({name: each.cpu().contiguous() for name, each in tensors.items()})
-        record = CheckpointRecord(step=step, sha256=hashlib.sha256(content).hexdigest())
-        write_file(staging / "tensors.safetensors", content)
-        write_record(staging / "checkpoint.json", record)
-        target = folder / f"step_{step:09d}"
-        if target.exists():
-            shutil.rmtree(target)
-        staging.rename(target)
-        sync_folder(folder)
-        left_over = list(folder.glob(".staging-*"))  # of a run killed while it saved
-        for old in (*left_over, *(each.folder for each in self.checkpoints()[:-KEPT])):
-            shutil.rmtree(old)
+        record = CheckpointRecord(step=step, sha256=sha256(content))
+        target = self.folder / "checkpoints" / f"step_{step:09d}"
+        make_folders(target.parent)
+        remove_tree(target)
+        files = {"tensors.safetensors": content, "checkpoint.json": record_bytes(record)}
+        publish_folder(self.folder, target, files, attempt=target.name)
+        remove_abandoned(self.folder)  # by a run that was killed while it saved
+        for checkpoint in self.checkpoints()[:-KEPT]:
+            remove_tree(checkpoint.folder)
 
     def check_dataset(self, dataset: Dataset) -> None:
         """Refuses data that the run was not trained on.
@@ -176,7 +171,6 @@ def open_run(folder: str | Path) -> Run:
 
 def write_run(folder: Path, record: RunRecord) -> Run:
     """Writes `run.json`, replacing an older one at once."""
-    folder.mkdir(parents=True, exist_ok=True)
     write_record(folder / "run.json", record)
     return Run(folder, record)
 

@@ -1,16 +1,15 @@
 """The `[training]` table of a recipe, resolved: what a run does, validated once."""
 
-import json
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import TcmrlError, TrainingError, apply_overrides, first_problem, plugin
+from tcmrl_data import TcmrlError, TrainingError, apply_overrides, plugin
+from tcmrl_data.foundation.validation import validate_table
 
 ALGORITHMS = "tcmrl_algo.algorithms"
-Table = TypeVar("Table", bound=BaseModel)
 
 
 class TrainingConfig(BaseModel):
@@ -47,11 +46,12 @@ def resolve(
     if algorithm is not None and isinstance(run, Mapping):
         tables["run"] = {**run, "algorithm": algorithm}
     shared = {name: tables.pop(name) for name in TrainingSettings.model_fields if name in tables}
-    settings = validated(TrainingSettings, shared, place)
+    settings = validate_table(TrainingSettings, shared, place=place, error=TrainingError)
     kind: type[BaseModel] = plugin(ALGORITHMS, "algorithm", settings.run.algorithm).Config
     for name in sorted(tables):
         _check_method_table(name, place)
-    method = validated(kind, tables.get(settings.run.algorithm, {}), f"{place}, [{settings.run.algorithm}]")
+    name = settings.run.algorithm
+    method = validate_table(kind, tables.get(name, {}), place=place, error=TrainingError, table=name)
     return TrainingConfig(settings=settings, method=method.model_dump(mode="json"))
 
 
@@ -63,15 +63,3 @@ def _check_method_table(name: str, place: str) -> None:
         raise TrainingError(
             f"{place}: unknown table {name!r}; known are {known}, and one named after each algorithm"
         ) from None
-
-
-def validated(kind: type[Table], values: Mapping[str, Any], place: str) -> Table:
-    """The values as a settings object; strict, but for lists that stand for tuples.
-
-    Raises:
-        TrainingError: with the first complaint in one line.
-    """
-    try:
-        return kind.model_validate_json(json.dumps(values, default=str), strict=True)
-    except ValidationError as error:
-        raise TrainingError(f"{place}: {first_problem(error)}") from None

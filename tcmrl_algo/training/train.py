@@ -14,11 +14,12 @@ from torch import Tensor
 from tcmrl_algo.methods.problem import Algorithm, MomentsRecord, problem_of
 from tcmrl_algo.training.batches import Batches, open_batches
 from tcmrl_algo.training.checkpoint import Run, RunRecord, digest, open_run, write_run
-from tcmrl_algo.training.config import ALGORITHMS, TrainingConfig, validated
+from tcmrl_algo.training.config import ALGORITHMS, TrainingConfig
 from tcmrl_algo.training.interruption import DeferredInterrupts
 from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_algo.training.metrics import MetricsWriter
 from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError, plugin
+from tcmrl_data.foundation.validation import validate_table
 
 PACKAGES = ("torch", "numpy")
 """Whose versions results depend on."""
@@ -202,7 +203,9 @@ def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
         device=usable_device(record.device),
     )
     module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
-    config = validated(module.Config, record.config.method, f"[{settings.run.algorithm}]")
+    config = validate_table(
+        module.Config, record.config.method, place="run.json", error=TrainingError, table="config.method"
+    )
     algorithm: Algorithm = module.create(problem, settings, config)
     return algorithm
 

@@ -29,6 +29,9 @@ from tcmrl_data.store.manifest import (
     seal,
 )
 
+WORKER = "tcmrl_data.build.worker"
+"""Module that does a unit."""
+
 MANIFEST_SECONDS = 1.0
 """The manifest is rewritten at most this often while parts arrive, and at the end."""
 
@@ -100,6 +103,7 @@ class Driver:
         return Unit(
             _unit_id(tasks),
             spec.to_json(),
+            WORKER,
             cost=self._source.training_steps * len(tasks),
             cpus=asked.cpus,
             gpus=asked.gpus,

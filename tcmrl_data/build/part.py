@@ -1,6 +1,6 @@
 """The making of a part: a snapshot's rollouts, their record, and their publication."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
@@ -8,6 +8,7 @@ import numpy as np
 
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.build.provenance import provenance
+from tcmrl_data.engine.worker import Report
 from tcmrl_data.envs.base import Environment, Lanes
 from tcmrl_data.envs.controller import Controller, UniformController
 from tcmrl_data.envs.rollout import roll_out
@@ -31,9 +32,6 @@ from tcmrl_data.store.manifest import (
     read_part_record,
 )
 from tcmrl_data.store.statistics import statistics
-
-Report = Callable[[Mapping[str, Any]], None]
-"""Receives `{"kind": "steps", "count"}` and `{"kind": "part", "task", "step", "id"}`."""
 
 
 @final
@@ -73,7 +71,12 @@ class PartMaker:
             self._lanes = None
 
     def publish(self, snapshot: Snapshot, report: Report) -> str:
-        """Publishes the part of a snapshot and returns its id."""
+        """Publishes the part of a snapshot and returns its id.
+
+        Args:
+            snapshot: the policy.
+            report: told `{"kind": "part", "task", "step", "id"}`.
+        """
         target = self._dataset / part_folder(self.task.index, snapshot.step)
         if (target / "part.json").is_file():
             record = read_part_record(target / "part.json")

@@ -9,8 +9,9 @@ from typing import Any
 
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.build.part import PartMaker, Report, part_bytes
+from tcmrl_data.build.part import PartMaker, part_bytes
 from tcmrl_data.build.provenance import package_versions
+from tcmrl_data.engine.worker import Report
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.recipe.recipe import Recipe

@@ -15,7 +15,7 @@ from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TaskError, TrajectoryError
 from tcmrl_data.foundation.plain_files import folder_problem
-from tcmrl_data.recipe.recipe import first_problem
+from tcmrl_data.foundation.validation import first_problem
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.layout import ArrayLayout, check_expansion
 from tcmrl_data.store.manifest import (

@@ -33,7 +33,7 @@ class Unit:
 
     id: str
     spec: Mapping[str, Any]
-    worker: str = "tcmrl_data.engine.worker"
+    worker: str
     threads: int = 1
     cost: float = 1.0
     cpus: float = 1.0
@@ -49,7 +49,7 @@ class Result:
     Attributes:
         id: the unit.
         ok: it is done.
-        digest: digest over the unit's part ids, where ok.
+        digest: what the worker returned for the work done, where ok: equal work, equal digest.
         error: one line, where not ok.
         attempt: attempts made, from 1.
         node: host that ran the last attempt.

@@ -1,6 +1,7 @@
-"""The process of one unit: `python -m tcmrl_data.engine.worker`, a JSON spec on standard input.
+"""The worker's side of a unit's process: a JSON spec on standard input, messages on standard output.
 
-Messages go to standard output as JSON lines, the last one `{"kind": "result", "digest" | "error"}`.
+A module becomes a worker by calling `serve`; engines run it as `python -m <module>`. Messages go to standard
+output as JSON lines, the last one `{"kind": "result", "digest" | "error"}`.
 The process ends when standard input closes, so that a killed driver leaves no orphan. On SIGTERM it abandons
 the unit: what it published stands, what it had staged is removed.
 """
@@ -15,10 +16,12 @@ from collections.abc import Callable, Mapping
 from types import FrameType
 from typing import Any
 
-from tcmrl_data.build.unit import UnitSpec, run_unit
 from tcmrl_data.foundation.errors import TcmrlError
 
 REPORT_SECONDS = 0.5
+
+Report = Callable[[Mapping[str, Any]], None]
+"""Receives a unit's messages; each has a `kind`, and those of kind `steps` a `count` to add up."""
 
 
 class _Reporter:
@@ -56,7 +59,7 @@ def _abandon(signal_number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + signal_number)
 
 
-def serve(work: Callable[[dict[str, Any], Callable[[Mapping[str, Any]], None]], str]) -> None:
+def serve(work: Callable[[dict[str, Any], Report], str]) -> None:
     """Makes this process a worker: does the unit whose spec is the first line of standard input.
 
     Args:
@@ -73,14 +76,3 @@ def serve(work: Callable[[dict[str, Any], Callable[[Mapping[str, Any]], None]], 
         report({"kind": "result", "error": str(error)})
     sys.stderr.flush()
     os._exit(0)  # all is written and told; taking the libraries down in order would take a second
-
-
-def _build_parts(spec: dict[str, Any], report: Callable[[Mapping[str, Any]], None]) -> str:
-    import torch
-
-    torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently
-    return run_unit(UnitSpec.from_json(spec), report)
-
-
-if __name__ == "__main__":
-    serve(_build_parts)

@@ -94,15 +94,21 @@ def sync_tree(folder: Path) -> None:
         disk.sync(each)
 
 
-def replace_file(path: Path, data: bytes, *, staging: Path) -> None:
+def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> None:
     """Puts `data` at a path in one step: readers see the old file or the new one.
+
+    Args:
+        path: the file; folders above it are made.
+        data: its content.
+        staging: folder for the unfinished file; it lies beside the file, hidden, where None.
 
     Raises:
         StorageError: the disk refuses; the old file stands.
     """
-    _make_staging(staging)
+    if staging is not None:
+        _make_staging(staging)
     make_folders(path.parent)
-    temporary = staging / f"{path.name}.{uuid.uuid4().hex}"
+    temporary = (staging or path.parent) / f"{'' if staging else '.'}{path.name}.{uuid.uuid4().hex}"
     with named_errors(path):
         try:
             write_file(temporary, data)
@@ -117,12 +123,12 @@ def remove_tree(folder: Path) -> None:
     shutil.rmtree(folder, ignore_errors=True)
 
 
-def publish_folder(dataset: Path, target: Path, files: Mapping[str, bytes], *, attempt: str) -> bool:
+def publish_folder(root: Path, target: Path, files: Mapping[str, bytes], *, attempt: str) -> bool:
     """Makes a folder with the given files appear at `target` in one step.
 
     Args:
-        dataset: folder whose staging area is used.
-        target: final place inside the dataset; its parent exists.
+        root: folder whose staging area is used, such as a dataset's.
+        target: final place inside it; its parent exists.
         files: relative path to content.
         attempt: names the staging folder, for people who look.
 
@@ -132,7 +138,7 @@ def publish_folder(dataset: Path, target: Path, files: Mapping[str, bytes], *, a
     Raises:
         StorageError: the disk refuses; nothing is published.
     """
-    staging = dataset / STAGING
+    staging = root / STAGING
     _make_staging(staging)
     staged = staging / f"{attempt}.{uuid.uuid4().hex}"
     with lock_file(staged.with_name(f"{staged.name}.lock"), "this attempt") as lock:
@@ -207,13 +213,13 @@ def _holder(path: Path) -> str:
     return path.read_text(errors="replace").strip()[:200] or "another process"
 
 
-def remove_abandoned(dataset: Path) -> list[str]:
-    """Removes staging whose owner is gone; returns what was removed. The caller holds the dataset's lock.
+def remove_abandoned(root: Path) -> list[str]:
+    """Removes staging whose owner is gone; returns what was removed. The caller is the only writer.
 
     An attempt is made after its lock and removed before it, so what has no lock has no owner; and files on
     their way to their place belong to the lock's holder, or to a worker whose driver is gone.
     """
-    staging = dataset / STAGING
+    staging = root / STAGING
     removed = []
     for lock in sorted(staging.glob("*.lock")) if staging.is_dir() else []:
         with contextlib.suppress(LockedError), lock_file(lock, lock.name):

@@ -1,4 +1,4 @@
-"""What every record of a dataset is validated with: strictly, and without text that a terminal would obey."""
+"""Records as JSON files, and the strict reading of a stranger's: no text that a terminal would obey."""
 
 import unicodedata
 from pathlib import Path
@@ -7,25 +7,62 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from tcmrl_data.foundation.canonical import canonical_json
-from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.foundation.disk import replace_file
+from tcmrl_data.foundation.errors import CheckpointError, ManifestError, TcmrlError
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.recipe.recipe import first_problem
+from tcmrl_data.foundation.validation import first_problem
 
 HIDDEN_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Unicode categories of control, direction and surrogate characters and of line separators."""
 
 
 class Record(BaseModel):
-    """Frozen, no unknown keys, no conversion of types, no NaN."""
+    """A record of a dataset: frozen, no unknown keys, no conversion of types, no NaN."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-Kind = TypeVar("Kind", bound=Record)
+Kind = TypeVar("Kind", bound=BaseModel)
 
 
-def validated(kind: type[Kind], values: Any, file: Path, *, version: int) -> Kind:
-    """A record of parsed JSON.
+def write_record(file: Path, record: BaseModel) -> None:
+    """Writes a record as JSON, in one step.
+
+    Raises:
+        StorageError: the disk refuses; the old file stands.
+    """
+    replace_file(file, record_bytes(record))
+
+
+def record_bytes(record: BaseModel) -> bytes:
+    """A record as the text of a JSON file."""
+    return (record.model_dump_json(indent=1, by_alias=True) + "\n").encode()
+
+
+def read_record(
+    kind: type[Kind], file: Path, *, remedy: str = "", error: type[TcmrlError] = CheckpointError
+) -> Kind:
+    """Takes back what `write_record` wrote.
+
+    Args:
+        kind: what it is a record of.
+        file: where.
+        remedy: ends the message where the content is no such record.
+        error: the kind of error to raise; a training run's by default.
+
+    Raises:
+        TcmrlError: of the given kind: the file is missing, or is not such a record.
+    """
+    try:
+        return kind.model_validate_json(file.read_bytes())
+    except OSError as problem:
+        raise error(f"{file} cannot be read: {problem.strerror}") from None
+    except ValidationError as problem:
+        raise error(f"{file}: {first_problem(problem)}{remedy}") from None
+
+
+def parse_record(kind: type[Kind], values: Any, file: Path, *, version: int) -> Kind:
+    """A dataset's record of parsed JSON, validated strictly.
 
     Raises:
         ManifestError: another schema version, hidden text, or values that do not validate; names file

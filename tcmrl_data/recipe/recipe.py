@@ -1,22 +1,22 @@
 """Recipes: hand-written TOML in `manifests/`, resolved once into a validated, frozen configuration."""
 
-import json
+import functools
 import tomllib
 from collections.abc import Mapping, Sequence
 from importlib.resources.abc import Traversable
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment, make_environment
 from tcmrl_data.foundation.errors import RecipeError
+from tcmrl_data.foundation.validation import validate_table
 
 Profile = Literal["paper", "quick", "reduced"]
 PROFILES: tuple[Profile, ...] = ("paper", "quick", "reduced")
 RECIPE_SCHEMA = 1
 TABLES = {"about", "environment", "behavior", "rollouts", "build", "training"}
-Table = TypeVar("Table", bound=BaseModel)
 
 
 class _Table(BaseModel):
@@ -135,18 +135,19 @@ def load_recipe(
         raise RecipeError(f"{place}: unknown table {unknown[0]!r}; known are {', '.join(sorted(TABLES))}")
     if behavior is not None:
         tables["behavior"]["source"] = behavior
-    chosen = _validated(_Behavior, _without_tables(tables["behavior"]), f"{place}, [behavior]")
+    validated = functools.partial(validate_table, place=place, error=RecipeError)
+    chosen = validated(_Behavior, _without_tables(tables["behavior"]), table="behavior")
     settings = _behavior_settings(tables["behavior"], chosen.source, place)
-    environment = _validated(kind.Settings, tables["environment"] | {"name": name}, f"{place}, [environment]")
+    environment = validated(kind.Settings, tables["environment"] | {"name": name}, table="environment")
     training = {each: _profile(document, each).get("training", {}) for each in _profiles(document)}
     training[profile] = tables.get("training", {})
     return Recipe(
         profile=profile,
-        about=_validated(About, tables["about"], f"{place}, [about]"),
+        about=validated(About, tables["about"], table="about"),
         environment=environment.model_dump(mode="json"),
         behavior=chosen.model_dump() | {"settings": settings.model_dump(mode="json")},
-        rollouts=_validated(Rollouts, tables["rollouts"], f"{place}, [rollouts]"),
-        build=_validated(TaskChoice, tables.get("build", {}), f"{place}, [build]"),
+        rollouts=validated(Rollouts, tables["rollouts"], table="rollouts"),
+        build=validated(TaskChoice, tables.get("build", {}), table="build"),
         training=training,
     )
 
@@ -176,31 +177,15 @@ def apply_overrides(table: Mapping[str, Any], overrides: Sequence[str]) -> dict[
     return result
 
 
-def first_problem(error: ValidationError) -> str:
-    """The first complaint of a validation in one line: field, value, rule."""
-    detail = error.errors()[0]
-    field = ".".join(str(each) for each in detail["loc"]) or "values"
-    more = "" if error.error_count() == 1 else f" (and {error.error_count() - 1} more)"
-    given = "" if detail["type"] in ("missing", "value_error") else f", got {str(detail['input'])[:80]!r}"
-    return f"{field}: {detail['msg']}{given}{more}"
-
-
-def _validated(kind: type[Table], values: Mapping[str, Any], place: str) -> Table:
-    try:
-        return kind.model_validate_json(
-            json.dumps(values, default=str)
-        )  # JSON mode: strict, but lists may be tuples
-    except ValidationError as error:
-        raise RecipeError(f"{place}: {first_problem(error)}") from None
-
-
 def _behavior_settings(tables: Mapping[str, Any], source: str, place: str) -> BaseModel:
     """The source's settings: its own table, on top of that of the source whose settings it shares."""
     kind = BEHAVIOR_SOURCES.get(source)
     if source not in tables:
         raise RecipeError(f"{place}: behavior source {source!r} has no [behavior.{source}] table")
     values = _merged(tables.get(kind.extends or source, {}), tables[source])
-    settings: BaseModel = _validated(kind.Settings, values, f"{place}, [behavior.{source}]")
+    settings: BaseModel = validate_table(
+        kind.Settings, values, place=place, error=RecipeError, table=f"behavior.{source}"
+    )
     return settings
 
 

@@ -10,7 +10,7 @@ from pydantic import FailFast, Field, field_validator, model_validator
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, canonical_json, digest, parse_json, sha256
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
-from tcmrl_data.foundation.records import Record, validated
+from tcmrl_data.foundation.records import Record, parse_record
 from tcmrl_data.recipe.recipe import Profile, Recipe
 
 SCHEMA_VERSION = 1
@@ -259,7 +259,7 @@ def read_manifest(path: Path) -> Manifest:
         raise ManifestError(
             f"{file}: not a manifest ({one_line(error)}); build again or restore the file"
         ) from None
-    manifest = validated(Manifest, values, file, version=SCHEMA_VERSION)
+    manifest = parse_record(Manifest, values, file, version=SCHEMA_VERSION)
     fields = {key: value for key, value in values.items() if key != "digest"}
     if seal(fields) != data:
         raise ManifestError(f"{file}: digest does not match its contents; the file was edited or damaged")
@@ -290,7 +290,7 @@ def read_sealed_part(file: Path) -> tuple[PartRecord, str]:
         raise ManifestError(
             f"{file}: not a part record ({one_line(error)}); run `tcmrl-data repair`"
         ) from None
-    record = validated(PartRecord, values, file, version=SCHEMA_VERSION)
+    record = parse_record(PartRecord, values, file, version=SCHEMA_VERSION)
     if record.id != digest(values["identity"]):
         raise ManifestError(f"{file}: id is not the digest of its identity; run `tcmrl-data repair`")
     for name in record.files:

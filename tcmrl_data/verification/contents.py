@@ -15,7 +15,7 @@ from tcmrl_data.behavior.snapshot import GaussianPolicy, read_snapshot
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import draw_tasks
 from tcmrl_data.foundation.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
-from tcmrl_data.recipe.recipe import first_problem
+from tcmrl_data.foundation.validation import first_problem
 from tcmrl_data.store.arrays import array_digests, read_arrays, unpack
 from tcmrl_data.store.manifest import MAX_TASKS, STANDARD_ARRAYS, Manifest, PartRecord
 from tcmrl_data.store.statistics import statistics

@@ -1,0 +1,17 @@
+"""The process of one unit of a build: `python -m tcmrl_data.build.worker`, a JSON spec on standard input."""
+
+from typing import Any
+
+from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.engine.worker import Report, serve
+
+
+def _build_parts(spec: dict[str, Any], report: Report) -> str:
+    import torch
+
+    torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently
+    return run_unit(UnitSpec.from_json(spec), report)
+
+
+if __name__ == "__main__":
+    serve(_build_parts)
