@@ -6,9 +6,11 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.utils.env_checker import data_equivalence
 from stable_baselines3.common.buffers import ReplayBuffer
 from torch.utils.data import DataLoader
 
@@ -244,6 +246,25 @@ def test_minari_knows_the_scores_and_makes_the_task_again(
         seen, received, *_ = environment.step(action)
         np.testing.assert_allclose(seen, observation, atol=1e-5)
         np.testing.assert_allclose(received, reward, atol=1e-5)
+
+
+def test_minari_recovers_an_environment_with_the_spaces_of_the_data(
+    tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What `check_env_recovery` of Minari's own tests asserts, and that observations lie in their space."""
+    minari = pytest.importorskip("minari")
+    minari_format.export(tiny, tmp_path / "out", snapshots="last")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
+    opened = minari.load_dataset("tcmrl/point-robot/task00040-last-v0")
+    original = gymnasium.make(opened.spec.env_spec)
+    for recovered in (opened.recover_environment(), opened.recover_environment(eval_env=True)):
+        assert recovered.spec == original.spec
+        for name in ("observation_space", "action_space"):
+            assert data_equivalence(getattr(recovered, name), getattr(original, name))
+            assert data_equivalence(getattr(opened.spec, name), getattr(original, name))
+        assert recovered.reset(seed=0)[0] in recovered.observation_space
+        assert recovered.step(recovered.action_space.sample())[0] in recovered.observation_space
+        assert gymnasium.make(recovered.spec).observation_space == opened.spec.observation_space
 
 
 @pytest.mark.parametrize(

@@ -20,8 +20,10 @@ from typing import TYPE_CHECKING, Any, final
 
 import gymnasium
 import numpy as np
+import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
+from gymnasium.utils import RecordConstructorArgs
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.selection import Selection
@@ -30,7 +32,7 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import MissingPackageError, StoreError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
-from tcmrl_data.interchange.formats._new_folder import new_folder
+from tcmrl_data.interchange.formats._new_folder import new_folder, require_room_for
 from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
 from tcmrl_data.store.manifest import TaskReferences
 
@@ -74,7 +76,7 @@ class MinariFormat(Format):
         done = 0
         with new_folder(out) as folder, _datasets_path(folder):
             for task in selection.tasks:
-                for _ in _write_task(selection, task, dataset_id(dataset, task.index, snapshots)):
+                for _ in _write_task(selection, task, dataset_id(dataset, task.index, snapshots), folder):
                     done += 1
                     progress(done, total)
         return sorted(path for path in out.rglob("*") if path.is_file())
@@ -87,13 +89,30 @@ def dataset_id(dataset: Dataset, task: int, snapshots: str = "all") -> str:
 
 
 def make_task(settings: Mapping[str, Any], parameters: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
-    """The entry point by which Gymnasium makes an exported task again.
+    """The entry point by which Gymnasium makes an exported task again, with the float32 of its dataset.
 
     Args:
         settings: the recipe's `[environment]` table.
         parameters: of the task.
     """
-    return make_environment(settings).make(parameters)
+    return Float32Observations(make_environment(settings).make(parameters))
+
+
+class Float32Observations(gymnasium.ObservationWrapper[Any, Any, Any], RecordConstructorArgs):
+    """Observations in the precision of the dataset; environments themselves give float64."""
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        gymnasium.ObservationWrapper.__init__(self, env)
+        self.observation_space = _observation_space(*(env.observation_space.shape or ()))
+
+    def observation(self, observation: npt.NDArray[np.floating]) -> npt.NDArray[np.float32]:
+        """The observation as float32."""
+        return observation.astype(np.float32)
+
+
+def _observation_space(*shape: int) -> Box:
+    return Box(-np.inf, np.inf, shape, np.float32)
 
 
 @contextlib.contextmanager
@@ -109,11 +128,12 @@ def _datasets_path(folder: Path) -> Iterator[None]:
             os.environ["MINARI_DATASETS_PATH"] = before
 
 
-def _write_task(selection: Selection, task: Task, name: str) -> Iterator[int]:
+def _write_task(selection: Selection, task: Task, name: str, folder: Path) -> Iterator[int]:
     """Writes a task part by part; yields the step of every part written."""
     import minari
 
     dataset, steps = selection.dataset, selection.steps[task.index]
+    require_room_for(folder / "namespace_metadata.json")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`.*` is set to None", UserWarning)  # author, link: not ours to say
         written = minari.create_dataset_from_buffers(name, [], **_description(selection, task))
@@ -121,6 +141,7 @@ def _write_task(selection: Selection, task: Task, name: str) -> Iterator[int]:
     written.storage.update_metadata({"ref_max_score_source": source, "dataset_root": dataset.manifest.root})
     for step in steps:
         trajectories = dataset.trajectories(task.index, step)
+        require_room_for(folder / name / "data" / "main_data.hdf5", trajectories)
         first = written.total_episodes
         written.update_dataset_from_buffer(
             [_buffer(dataset, task, step, index, each) for index, each in enumerate(trajectories)]
@@ -145,7 +166,7 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
     return {
         "env": spec,
         "eval_env": spec,
-        "observation_space": Box(-np.inf, np.inf, (environment.observation_dim,), np.float32),
+        "observation_space": _observation_space(environment.observation_dim),
         "action_space": Box(-1.0, 1.0, (environment.action_dim,), np.float32),
         "algorithm_name": recipe.behavior["source"],
         "ref_min_score": references.uniform,
