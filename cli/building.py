@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
+from tcmrl_data.foundation.sizes import size
+
 from .frame import (
     duration,
     fail_incomplete,
@@ -16,7 +18,6 @@ from .frame import (
     print_table,
     remark,
     same_command,
-    size,
     stopped_by_signals,
 )
 from .plugins import BEHAVIOR, ENGINE
@@ -186,6 +187,7 @@ def build(
         click.echo(
             f"{report.dataset}: {report.built:,} parts built, {report.present:,} were there and hold, "
             f"in {duration(report.seconds)}; root {report.root[:12]}"
+            f"{'; the folder cannot be written, and nothing had to be' if report.read_only else ''}"
         )
     if report.failed:
         more = "" if len(report.failed) == 1 else f" (and {len(report.failed) - 1} more)"

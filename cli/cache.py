@@ -5,7 +5,9 @@ import datetime
 
 import click
 
-from .frame import make_table, output_options, print_json, print_table, remark, size
+from tcmrl_data.foundation.sizes import size
+
+from .frame import make_table, output_options, print_json, print_table, remark
 
 
 @click.group()

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import click
 
+from tcmrl_data.foundation.sizes import size
+
 from .building import build, plan
 from .cache import cache
-from .frame import main_program, make_table, output_options, print_json, print_table, remark, size
+from .frame import main_program, make_table, output_options, print_json, print_table, remark
 from .inspection import inspect
 from .plugins import FORMAT
 from .progress import StageProgress

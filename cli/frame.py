@@ -87,7 +87,8 @@ def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
     except click.Abort:
         return _fail(INTERRUPTED, INCOMPLETE)
     except OSError as error:
-        return _fail(f"{error.filename or 'a file'}: {error.strerror or error}", BAD_INPUT)
+        place = error.filename or shlex.join([str(command.name), *typed])
+        return _fail(f"{place}: {error.strerror or error}", BAD_INPUT)
     return result if isinstance(result, int) else DONE
 
 
@@ -205,15 +206,6 @@ def duration(seconds: float) -> str:
         if whole >= long:
             return f"{whole // long} {name} {whole % long // short} {short_name}"
     return f"{seconds:.1f} s" if seconds < 10 else f"{whole} s"
-
-
-def size(num_bytes: float) -> str:
-    """Bytes in decimal units, such as `12.3 MB`."""
-    for unit in ("B", "kB", "MB", "GB"):
-        if num_bytes < 1_000:
-            return f"{num_bytes:.0f} B" if unit == "B" else f"{num_bytes:.1f} {unit}"
-        num_bytes /= 1_000
-    return f"{num_bytes:.1f} TB"
 
 
 def _fail(message: str, code: int) -> int:

@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import click
 
 from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.sizes import size
 
-from .frame import duration, fail_incomplete, output_options, print_json, size
+from .frame import duration, fail_incomplete, output_options, print_json
 from .progress import StageProgress
 
 if TYPE_CHECKING:
@@ -110,6 +111,7 @@ def repair(dataset: Path, as_json: bool, quiet: bool, deep: bool, workers: int |
         click.echo(
             f"{printable(str(report.dataset))}: {len(report.repaired):,} parts made again, "
             f"{len(report.groups):,} group records written, {_count(report.left)} left"
+            f"{'; the folder cannot be written, and nothing had to be' if report.read_only else ''}"
         )
     if report.failed:
         fail_incomplete(f"{report.failed[0]}; the same command goes on from there")

@@ -36,6 +36,7 @@ from .foundation.seeding import NO_TASK as NO_TASK
 from .foundation.seeding import Purpose as Purpose
 from .foundation.seeding import keyed_generator as keyed_generator
 from .foundation.seeding import keyed_seed as keyed_seed
+from .foundation.sizes import parse_bytes as parse_bytes
 from .interchange.formats.base import FORMATS as FORMATS
 from .recipe.listing import list_environments as list_environments
 from .recipe.recipe import PROFILES as PROFILES
@@ -52,7 +53,6 @@ from .sampling.cache import cache_folder as cache_folder
 from .sampling.cache import cache_limit as cache_limit
 from .sampling.cache import clear_cache as clear_cache
 from .sampling.cache import list_cache as list_cache
-from .sampling.cache import parse_bytes as parse_bytes
 from .sampling.prefetch import Prefetch as Prefetch
 from .sampling.sampler import Sampler as Sampler
 from .store.manifest import Manifest as Manifest

@@ -193,14 +193,16 @@ def test_decoding_takes_the_memory_of_the_parts_at_work(
     assert (table == np.arange(40)[:, None] * rows).all()
 
 
-@pytest.mark.parametrize(("text", "expected"), [("2G", 2 * 10**9), ("500M", 5 * 10**8), ("1.5 kB", 1500)])
+@pytest.mark.parametrize(
+    ("text", "expected"), [("2G", 2 * 10**9), ("500M", 5 * 10**8), ("1.5 kB", 1500), ("1K", 1000)]
+)
 def test_sizes_are_read_in_decimal_units(text: str, expected: int) -> None:
     assert parse_bytes(text) == expected
 
 
-@pytest.mark.parametrize("text", ["", "0", "-1G", "2 X", "many"])
+@pytest.mark.parametrize("text", ["", "0", "0.1", "-1G", "2 X", "many"])
 def test_what_is_no_size_is_refused(text: str) -> None:
-    with pytest.raises(CacheError, match="is no size"):
+    with pytest.raises(CacheError, match="is no size; write a number above 0 and one of B, k, M, G, T"):
         parse_bytes(text)
 
 

@@ -187,7 +187,7 @@ def test_a_full_disk_ends_in_a_clear_error_and_a_resumable_dataset(
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(build, "part_bytes", lambda recipe: 0)  # let it start, so that it fills up
             (failure,) = parts.build(disk / "data", patch).failed
-        assert "No space left on device; mend the disk" in failure
+        assert "No space left on device; make room" in failure
         subprocess.run(["mount", "-o", "remount,size=10m", str(disk)], check=True)
         expect_whole(parts, tiny, disk / "data")
     finally:
@@ -198,7 +198,7 @@ def test_too_little_space_is_said_before_the_start(
     parts: PreparedParts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(build, "part_bytes", lambda recipe: 10**15)
-    with pytest.raises(StorageError, match=r"3 parts take up to 3000000.00 GB, \d+\.\d+ GB are free"):
+    with pytest.raises(StorageError, match=r"3 parts take up to 3000.0 TB, \d+\.\d [kMGT]B are free"):
         parts.build(tmp_path / "data", monkeypatch)
     assert not (tmp_path / "data" / "tasks").exists()
 

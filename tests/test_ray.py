@@ -90,9 +90,9 @@ def test_a_supervisor_that_is_killed_is_replaced_by_ray(
 @pytest.mark.parametrize(
     ("asked", "told"),
     [
-        ("cpus=64", "64 cpus, 0 gpus, 0.4 GB"),
-        ("gpus=0.5", "1 cpus, 0.5 gpus, 0.4 GB"),
-        ("memory=900000000000000", "1 cpus, 0 gpus, 900000.0 GB"),
+        ("cpus=64", "64 cpus, 0 gpus, 419.5 MB"),
+        ("gpus=0.5", "1 cpus, 0.5 gpus, 419.5 MB"),
+        ("memory=900000000000000", "1 cpus, 0 gpus, 900.0 TB"),
     ],
 )
 def test_what_the_cluster_can_never_place_is_refused_at_once(

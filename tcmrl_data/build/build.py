@@ -13,7 +13,8 @@ from tcmrl_data.build.part import part_bytes
 from tcmrl_data.engine.base import ENGINES
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_file, make_folders, remove_abandoned
-from tcmrl_data.foundation.errors import BuildError, StorageError
+from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
+from tcmrl_data.foundation.sizes import size
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import DATA_VERSION, MANIFEST, read_manifest
@@ -31,6 +32,7 @@ class BuildReport:
         present: parts that were there and whose digests held.
         failed: one line per unit that failed.
         root: Merkle root of the dataset as it now stands.
+        read_only: the folder cannot be written, and nothing had to be.
     """
 
     dataset: Path
@@ -39,6 +41,7 @@ class BuildReport:
     failed: tuple[str, ...]
     seconds: float
     root: str
+    read_only: bool
 
 
 def build_dataset(
@@ -68,6 +71,7 @@ def build_dataset(
         BuildError: `out` is no dataset, or one of other settings or another seed.
         LockedError: another process builds this dataset.
         StoreError: a published part is damaged.
+        ReadOnlyError: the folder cannot be written, and something is missing.
         StorageError: too little free space, or the disk refused; what was published stands.
     """
     started = time.monotonic()
@@ -75,19 +79,27 @@ def build_dataset(
     chosen = choose_tasks(recipe, tasks)
     _check_folder(out, recipe, seed)
     make_folders(out)
-    with lock_file(out / LOCK, f"dataset {out}"):
-        remove_abandoned(out)
+    failed: tuple[str, ...] = ()
+    read_only = False
+    try:
+        with lock_file(out / LOCK, f"dataset {out}"):
+            remove_abandoned(out)
+            driver = Driver(recipe, out, seed, [*_earlier_tasks(out, recipe), *chosen])
+            _check_space(out, recipe, driver.missing_parts)
+            present = len(driver.parts)
+            if driver.missing_parts:
+                with EventLog(out, progress) as log:
+                    failed = driver.run(runner, log)
+            else:
+                driver.write_manifest()
+    except ReadOnlyError:
         driver = Driver(recipe, out, seed, [*_earlier_tasks(out, recipe), *chosen])
-        _check_space(out, recipe, driver.missing_parts)
-        present = len(driver.parts)
-        failed: tuple[str, ...] = ()
-        if driver.missing_parts:
-            with EventLog(out, progress) as log:
-                failed = driver.run(runner, log)
-        else:
-            driver.write_manifest()
+        present, read_only = len(driver.parts), True
+        if not driver.is_finished():
+            raise
     seconds = time.monotonic() - started
-    return BuildReport(out, len(driver.parts) - present, present, failed, seconds, driver.root)
+    built = len(driver.parts) - present
+    return BuildReport(out, built, present, failed, seconds, driver.root, read_only)
 
 
 def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
@@ -133,6 +145,6 @@ def _check_space(out: Path, recipe: Recipe, num_parts: int) -> None:
     needed, free = num_parts * part_bytes(recipe), shutil.disk_usage(out).free
     if needed > free:
         raise StorageError(
-            f"{out}: {num_parts} parts take up to {needed / 1e9:.2f} GB, {free / 1e9:.2f} GB are free; "
+            f"{out}: {num_parts} parts take up to {size(needed)}, {size(free)} are free; "
             "make room or build fewer --tasks at a time"
         )

@@ -142,8 +142,23 @@ class Driver:
             raise StoreError(f"{folder}: was built with other settings; run `tcmrl-data repair`")
         self._entries[task, step] = PartEntry(task=task, step=step, id=record.id, sha256=sealed)
 
+    def is_finished(self) -> bool:
+        """No part is missing, and the manifest says so."""
+        return not self.missing_parts and self._is_written(self._manifest())
+
     def write_manifest(self) -> None:
         """Writes the manifest from the parts, unless it stands there already."""
+        data = self._manifest()
+        if not self._is_written(data):
+            replace_file(self._out / MANIFEST, data, staging=self._out / STAGING)
+        self._written = time.monotonic()
+
+    def _is_written(self, data: bytes) -> bool:
+        file = self._out / MANIFEST
+        return file.is_file() and file.read_bytes() == data
+
+    def _manifest(self) -> bytes:
+        """The manifest of the parts; sets the root."""
         entries = [self._entries[key] for key in sorted(self._entries)]
         self.root = merkle_root(entries)
         tasks = [self._tasks[index] for index in sorted(self._tasks)]
@@ -164,10 +179,7 @@ class Driver:
                 if self._is_done(index)
             },
         }
-        data, file = seal(fields), self._out / MANIFEST
-        if not file.is_file() or file.read_bytes() != data:
-            replace_file(file, data, staging=self._out / STAGING)
-        self._written = time.monotonic()
+        return seal(fields)
 
     def _references(self, index: int) -> TaskReferences:
         records = [self.parts[index, step] for step in self._source.steps]

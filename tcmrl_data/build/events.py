@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tcmrl_data.foundation.disk import LOCK, lock_holder
+from tcmrl_data.foundation.disk import LOCK, lock_holder, named_errors
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
 
 EVENTS = "events.jsonl"
@@ -67,7 +67,8 @@ class EventLog:
         now = time.time()
         if event.kind != "steps" or now - self._steps_written >= STEPS_SECONDS:
             line = {"time": round(now, 3), "process": os.getpid(), **dataclasses.asdict(event)}
-            os.write(self._file, json.dumps(line).encode() + b"\n")
+            with named_errors(self._path):
+                os.write(self._file, json.dumps(line).encode() + b"\n")
             self._steps_written = now if event.kind == "steps" else self._steps_written
         self._progress(event)
 

@@ -16,6 +16,7 @@ from typing import Any, final
 from tcmrl_data.engine._attempt import GRACE_SECONDS, Outcome, run_attempt
 from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
 from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.sizes import size
 
 LOST_RETRIES = 3
 """How often Ray itself tries an attempt again that was lost with its machine."""
@@ -223,4 +224,4 @@ def _refuse_unplaceable(nodes: Sequence[Mapping[str, Any]], units: Sequence[Unit
 
 def _resources(resources: Mapping[str, float]) -> str:
     cpus, gpus, memory = (resources.get(name, 0) for name in ("CPU", "GPU", "memory"))
-    return f"{cpus:g} cpus, {gpus:g} gpus, {memory / 1e9:.1f} GB"
+    return f"{cpus:g} cpus, {gpus:g} gpus, {size(memory)}"

@@ -5,15 +5,19 @@ import errno
 import fcntl
 import os
 import shutil
+import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import TextIO
 
-from tcmrl_data.foundation.errors import LockedError, StorageError
+from tcmrl_data.foundation.errors import LockedError, ReadOnlyError, StorageError
 
 STAGING = ".staging"
 LOCK = ".lock"
 CHECKPOINTS = ".checkpoints"
+
+GO_ON = "make room on the disk or mend it, then run the same command again to go on"
 
 
 class Disk:
@@ -168,15 +172,35 @@ def move_into_place(staged: Path, target: Path) -> bool:
 
 
 @contextlib.contextmanager
-def named_errors(path: Path) -> Iterator[None]:
-    """Turns what the operating system reports into an error with a remedy."""
+def named_errors(path: Path, *, remedy: str = GO_ON) -> Iterator[None]:
+    """Turns what the operating system reports into an error that names the path and a remedy.
+
+    Raises:
+        StorageError: the disk refuses.
+    """
     try:
         yield
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error)
-        raise StorageError(
-            f"cannot write {path}: {reason}; mend the disk, then run the same command again to go on"
-        ) from None
+        raise StorageError(f"cannot write {path}: {reason}; {remedy}") from None
+
+
+def require_room(file: Path, num_bytes: int, *, remedy: str = GO_ON) -> None:
+    """Checks that a file can grow, or be made, before a library writes it that fails badly if it cannot.
+
+    The bytes are reserved for a moment in an unnamed file, so that quotas and limits of a file's size count.
+
+    Args:
+        file: its folder exists.
+        num_bytes: by how much it grows.
+        remedy: ends the error's text.
+
+    Raises:
+        StorageError: the disk refuses.
+    """
+    with named_errors(file, remedy=remedy), tempfile.TemporaryFile(dir=file.parent) as scratch:
+        size = file.stat().st_size if file.exists() else 0
+        os.posix_fallocate(scratch.fileno(), size, num_bytes)
 
 
 @contextlib.contextmanager
@@ -185,8 +209,9 @@ def lock_file(path: Path, what: str) -> Iterator[Path]:
 
     Raises:
         LockedError: another process holds it; the message names that process.
+        ReadOnlyError: the folder cannot be written.
     """
-    with path.open("a+") as file:
+    with _open_lock(path) as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -195,6 +220,17 @@ def lock_file(path: Path, what: str) -> Iterator[Path]:
         file.write(f"process {os.getpid()} on {os.uname().nodename}")
         file.flush()
         yield path
+
+
+def _open_lock(path: Path) -> TextIO:
+    try:
+        return path.open("a+")
+    except OSError as error:
+        if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
+            raise
+        raise ReadOnlyError(
+            f"{path.parent} cannot be written ({error.strerror}); use a copy that can"
+        ) from None
 
 
 def lock_holder(path: Path) -> str | None:

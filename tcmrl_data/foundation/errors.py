@@ -49,6 +49,10 @@ class StorageError(BuildError):
     """The disk refused an operation; what was published before stands."""
 
 
+class ReadOnlyError(StorageError):
+    """The dataset's folder cannot be written by this user, or lies on a disk that is mounted to be read."""
+
+
 class CacheError(TcmrlError):
     """The cache of decoded steps cannot be used, or a size of it that cannot be read."""
 

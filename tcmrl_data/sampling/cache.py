@@ -7,17 +7,17 @@ they stay under a cap; what was used longest ago goes first, what is in use stay
 import contextlib
 import fcntl
 import os
-import re
 import shutil
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, make_folders, remove_abandoned, remove_tree
-from tcmrl_data.foundation.errors import CacheError, LockedError
+from tcmrl_data.foundation.errors import CacheError, LockedError, StorageError
+from tcmrl_data.foundation.sizes import parse_bytes, size
 from tcmrl_data.sampling.cache_entry import (
     FORMAT,
     RECORD,
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 
 CACHE_BYTES = 100 * 10**9
 """What all entries may take, unless TCMRL_CACHE_LIMIT says otherwise (such as 20G)."""
-
-UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
 
 @dataclass(frozen=True)
@@ -56,18 +54,6 @@ class CacheEntry:
     bytes: int
     used: float
     in_use: bool
-
-
-def parse_bytes(text: str) -> int:
-    """Bytes named by text such as `2G`, `500M` or `1.5 GB`; decimal units.
-
-    Raises:
-        CacheError: it is no size.
-    """
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kMGT]?)B?", text.strip())
-    if match is None or not float(match[1]):
-        raise CacheError(f"{text!r} is no size above 0; write one such as 500M or 2G")
-    return int(float(match[1]) * UNITS[match[2]])
 
 
 def available_memory() -> int:
@@ -106,7 +92,7 @@ def load_rows(
     if needed <= limit:
         return read_rows(selection)
     why = "half of the available memory" if memory_limit is None else "the memory limit"
-    say(f"{needed / 1e9:.2f} GB of steps exceed {why}, {limit / 1e9:.2f} GB: using the cache")
+    say(f"{size(needed)} of steps exceed {why}, {size(limit)}: using the cache")
     return cached_rows(selection, say=say)
 
 
@@ -120,8 +106,7 @@ def cached_rows(selection: "Selection", *, say: Callable[[str], None] = lambda m
         say: told of decoding before it starts.
 
     Raises:
-        CacheError: no room, or the folder cannot be used.
-        StorageError: the disk refused.
+        CacheError: no room, or the folder cannot be written.
         StoreError: arrays that do not decode or do not form episodes; names the part.
     """
     folder = cache_folder()
@@ -129,15 +114,16 @@ def cached_rows(selection: "Selection", *, say: Callable[[str], None] = lambda m
     key = digest({"format": FORMAT, "root": root, "selection": selected(selection)})[:32]
     entry = folder / "rows" / key
     for _ in range(2):
-        rows = open_entry(entry, selection)
-        if rows is not None:
-            return rows
-        say(f"decoding {selection.dataset.folder} into {entry}; this happens once")
-        _remove_abandoned(folder)
-        _evict(folder, key)  # what lies there is torn
-        make_folders(folder)
-        _make_room(folder, _table_bytes(selection))
-        write_entry(folder, entry, selection)
+        with _named_cache(folder):
+            rows = open_entry(entry, selection)
+            if rows is not None:
+                return rows
+            say(f"decoding {selection.dataset.folder} into {entry}; this happens once")
+            _remove_abandoned(folder)
+            _evict(folder, key)  # what lies there is torn
+            make_folders(folder)
+            _make_room(folder, _table_bytes(selection))
+            write_entry(folder, entry, selection)
     raise CacheError(f"{entry} vanishes as it is made; give TCMRL_CACHE_LIMIT more room")
 
 
@@ -175,6 +161,23 @@ def cache_limit() -> int:
     return parse_bytes(text) if text else CACHE_BYTES
 
 
+@contextlib.contextmanager
+def _named_cache(folder: Path) -> Iterator[None]:
+    """Turns a refusal of the disk into an error that says where the cache may lie instead.
+
+    Raises:
+        CacheError: the disk refuses.
+    """
+    try:
+        yield
+    except (OSError, StorageError) as error:
+        reason = error.strerror if isinstance(error, OSError) else str(error).partition(";")[0]
+        raise CacheError(
+            f"the cache {folder} cannot be used ({reason}); set TCMRL_CACHE to a folder that can be written, "
+            "or raise --memory-limit"
+        ) from None
+
+
 def _table_bytes(selection: "Selection") -> int:
     rows, width = table_shape(selection, plan_rows(selection))
     return 4 * rows * width
@@ -198,7 +201,7 @@ def _make_room(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     if needed > free:
         raise CacheError(
-            f"{folder}: decoded steps take {needed / 1e9:.2f} GB, {free / 1e9:.2f} GB are free; make room, "
+            f"{folder}: decoded steps take {size(needed)}, {size(free)} are free; make room, "
             "set TCMRL_CACHE to a folder on another disk, or raise --memory-limit"
         )
 

@@ -19,7 +19,7 @@ from tcmrl_data.foundation.disk import (
     remove_tree,
     replace_file,
 )
-from tcmrl_data.foundation.errors import NondeterminismError
+from tcmrl_data.foundation.errors import NondeterminismError, ReadOnlyError
 from tcmrl_data.foundation.plain_files import folder_problem
 from tcmrl_data.store.layout import GROUP
 from tcmrl_data.store.manifest import MANIFEST, Manifest, part_folder, read_manifest, read_sealed_part, seal
@@ -39,6 +39,7 @@ class RepairReport:
         groups: group records above the parts that were written again.
         left: findings that a repair leaves to people: foreign files, and values of the manifest.
         failed: one line per task that could not be made again; the dataset is then as it was.
+        read_only: the folder cannot be written, and nothing had to be.
     """
 
     dataset: Path
@@ -46,6 +47,7 @@ class RepairReport:
     groups: tuple[str, ...]
     left: tuple[Finding, ...]
     failed: tuple[str, ...]
+    read_only: bool
 
 
 def repair_dataset(
@@ -71,11 +73,29 @@ def repair_dataset(
         ManifestError: the manifest itself is damaged. Delete the part folders that `verify` names and
             the manifest, then build with the options of the first build: parts that hold are taken in.
         LockedError: another process works on the dataset.
+        ReadOnlyError: the folder cannot be written, and something is damaged.
         NondeterminismError: a part came out with another id; nothing was replaced.
     """
     folder = Path(path).parent if Path(path).name == MANIFEST else Path(path)
     manifest = read_manifest(folder)
     check_work_files(folder)
+    try:
+        return _repair(folder, manifest, level=level, workers=workers, progress=progress)
+    except ReadOnlyError:
+        findings = verify_dataset(folder, level=level).findings
+        if any(not finding.foreign for finding in findings):
+            raise
+        return RepairReport(folder, (), (), findings, (), read_only=True)
+
+
+def _repair(
+    folder: Path,
+    manifest: Manifest,
+    *,
+    level: VerifyLevel,
+    workers: int | None,
+    progress: Callable[[BuildEvent], None],
+) -> RepairReport:
     with lock_file(folder / LOCK, f"dataset {folder}"):
         remove_abandoned(folder)
         findings = verify_dataset(folder, level=level).findings
@@ -89,11 +109,11 @@ def repair_dataset(
         if keys:
             failed = _make_again(folder, manifest, keys, workers, progress).failed
         if failed:
-            return RepairReport(folder, (), (), findings, failed)
+            return RepairReport(folder, (), (), findings, failed, read_only=False)
         groups = _restore(folder, manifest, keys, findings)
         remove_tree(folder / STAGING / REPAIR)
     left = verify_dataset(folder, level=level).findings
-    return RepairReport(folder, keys, groups, left, ())
+    return RepairReport(folder, keys, groups, left, (), read_only=False)
 
 
 def _make_again(

@@ -25,7 +25,7 @@ from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.formats._new_folder import new_folder
+from tcmrl_data.interchange.formats._new_folder import new_folder, require_room_for
 from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
 
 if TYPE_CHECKING:
@@ -93,15 +93,18 @@ def _write_task(selection: Selection, task: Task, path: Path) -> Iterator[int]:
     """Writes a task part by part; yields the step of every part written."""
     import h5py
 
+    require_room_for(path)
     with h5py.File(path, "x") as file:
         file.attrs.update(_attributes(selection, task))
         groups = file.create_group("episodes")
         for step in selection.steps[task.index]:
             trajectories = selection.dataset.trajectories(task.index, step)
+            require_room_for(path, trajectories)
             first = len(groups)
             _append(file, _flat(trajectories, first=first, step=step))
             for index, trajectory in enumerate(trajectories, start=first):
                 _write_episode(groups.create_group(f"{index:06d}"), trajectory, step)
+            file.flush()  # what the file keeps in memory is counted as room otherwise
             yield step
 
 

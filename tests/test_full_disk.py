@@ -1,0 +1,125 @@
+"""Disks that are full or read-only: one line that names the file and the remedy, and nothing half-written."""
+
+import json
+import os
+import resource
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import tcmrl_data
+from tcmrl_data import BuildEvent, Dataset
+from tcmrl_data.build.events import EventLog
+from tcmrl_data.foundation.errors import BuildError, CacheError, StorageError
+from tcmrl_data.foundation.sizes import size
+from tcmrl_data.sampling.cache import cached_rows
+from tests.conftest import TASKS, TINY
+from tests.disks import COMMAND_LINE, read_only, run_mounted, small_disk
+
+TASK_LIST = ",".join(map(str, TASKS))
+BUILD = ["point-robot", "--profile", "quick", *(word for text in TINY for word in ("--set", text))]
+FILES = {"hdf5": "task_00000.hdf5", "minari": "main_data.hdf5"}
+
+
+def assert_one_line(result: "subprocess.CompletedProcess[str]", *expected: str) -> None:
+    lines = result.stderr.strip().splitlines()
+    assert result.returncode == 2 and len(lines) == 1, result.stderr[-2_000:]
+    assert lines[0].startswith("Error: cannot write "), lines
+    assert all(text in lines[0] for text in expected), lines
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_an_export_to_a_full_disk_names_the_file_and_leaves_nothing(
+    name: str, tiny_folder: Path, tmp_path: Path
+) -> None:
+    if name == "minari":
+        pytest.importorskip(name)
+    result = run_mounted(
+        small_disk(tmp_path, 300),
+        *("export", tiny_folder, "--format", name, "--out", tmp_path / "out", "--quiet"),
+        then=f"ls -A {tmp_path}",
+    )
+    assert_one_line(result, f"{tmp_path}/out/", FILES[name], "No space left on device", "another disk")
+    assert result.stdout == ""
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_an_export_under_a_limit_of_file_sizes_names_the_file(
+    name: str, tiny_folder: Path, tmp_path: Path
+) -> None:
+    if name == "minari":
+        pytest.importorskip(name)
+    limit = 100_000
+    result = subprocess.run(
+        [*COMMAND_LINE, "export", tiny_folder, "--format", name, "--out", tmp_path / "out", "--quiet"],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert_one_line(result, f"{tmp_path}/out/", FILES[name], "File too large")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_finished_dataset_that_is_read_only_needs_no_build_and_no_repair(tiny_folder: Path) -> None:
+    built = run_mounted(
+        read_only(tiny_folder), "build", *BUILD, "--tasks", TASK_LIST, "--out", tiny_folder, "--json"
+    )
+    assert built.returncode == 0, built.stderr
+    report = json.loads(built.stdout)
+    assert (report["built"], report["present"], report["read_only"]) == (0, 15, True)
+    repaired = run_mounted(read_only(tiny_folder), "repair", tiny_folder)
+    assert repaired.returncode == 0, repaired.stderr
+    assert "0 parts made again" in repaired.stdout and "cannot be written" in repaired.stdout
+
+
+def test_a_read_only_dataset_that_lacks_parts_is_refused_by_name(tiny_copy: Callable[[], Path]) -> None:
+    copy = tiny_copy()
+    more = run_mounted(
+        read_only(copy), "build", *BUILD, "--tasks", f"{TASK_LIST},7", "--out", copy, "--quiet"
+    )
+    assert more.returncode == 2
+    assert more.stderr.startswith(f"Error: {copy} cannot be written") and more.stderr.count("\n") == 1
+    shutil.rmtree(copy / "tasks" / "00003")
+    damaged = run_mounted(read_only(copy), "repair", copy, "--quiet")
+    assert damaged.returncode == 2
+    assert damaged.stderr.startswith(f"Error: {copy} cannot be written") and damaged.stderr.count("\n") == 1
+
+
+def test_a_build_without_room_says_sizes_in_fitting_units(
+    tiny_recipe: tcmrl_data.Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1_234))
+    with pytest.raises(BuildError, match=r"3 parts take up to 8.3 kB, 1.2 kB are free"):
+        tcmrl_data.build_dataset(tiny_recipe, tmp_path / "out", tasks=[0])
+
+
+@pytest.mark.parametrize(
+    ("num_bytes", "expected"),
+    [(0, "0 B"), (999, "999 B"), (1_000, "1.0 kB"), (12_345_678, "12.3 MB"), (2e12, "2.0 TB")],
+)
+def test_a_size_has_the_unit_that_fits(num_bytes: float, expected: str) -> None:
+    assert size(num_bytes) == expected
+
+
+def test_a_cache_that_cannot_be_written_names_the_variable(
+    tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("TCMRL_CACHE", str(tmp_path / "file" / "cache"))
+    with pytest.raises(CacheError, match=r"Not a directory.*set TCMRL_CACHE to a folder that can be written"):
+        cached_rows(tiny.select(split="train"))
+
+
+def test_a_record_of_events_on_a_full_disk_is_named(tmp_path: Path) -> None:
+    event = BuildEvent("start", None, 0, 1, 0, 3, 0, 450, "1 of 1 tasks to build")
+    with EventLog(tmp_path, lambda event: None) as log:
+        full = os.open("/dev/full", os.O_WRONLY)
+        os.dup2(full, log._file)
+        os.close(full)
+        with pytest.raises(StorageError, match=r"events.jsonl: No space left on device; make room"):
+            log.write(event)
