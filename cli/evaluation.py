@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 import click
+
+from tcmrl_data.foundation.plugins import declared_names
 
 from .frame import make_table, number, output_options, print_json, print_table, remark
 from .progress import StageProgress
@@ -12,9 +14,9 @@ from .progress import StageProgress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tcmrl_algo import Evaluation
+    from tcmrl_algo import Evaluation, TaskResult
 
-Protocol = Literal["paper", "offline", "idaq"]
+ALL = "all"
 OTHER = "other: the same policy under other tasks' contexts"
 SCORES = {
     "regret": "regret: oracle - adapted",
@@ -22,40 +24,51 @@ SCORES = {
 }
 
 
-def score_table(results: Sequence["Evaluation"]) -> "Table":
-    """One row per test task and one of means; under each protocol what adaptation and its control reach."""
-    tasks = [task for each in results for task in each.tasks]
-    with_success = any(task.success is not None for task in tasks)
-    score = _score(results)
-    parts = ("adapted", "other", score, *(("success",) if with_success else ()))
-    columns = ["task", "uniform", "oracle"]
-    columns += [f"{each.protocol}\n{part}" for each in results for part in parts]
+def score_tables(results: Sequence["Evaluation"]) -> list["Table"]:
+    """One protocol: its test tasks. Several: the means of every protocol, then the test tasks of each."""
     first = results[0]
-    title = f"{first.algorithm} on {first.environment}, seed {first.seed}: returns on the test tasks"
-    table = make_table(title, columns=columns, text=("task",))
-    rows = []
-    for index, task in enumerate(first.tasks):
-        values = [task.random, task.oracle]
-        for each in results:
-            result = each.tasks[index]
-            values += [result.final, result.shuffled]
-            values += [result.regret if score == "regret" else result.normalized]
-            values += [result.success] if with_success else []
-        rows.append(values)
-        table.add_row(str(task.task), *(number(value) for value in values))
-    table.add_section()
-    table.add_row("mean", *(number(_mean(column)) for column in zip(*rows, strict=True)))
-    return table
+    run = f"{first.algorithm} on {first.environment}, seed {first.seed}"
+    score, with_success = _score(results), _with_success(results)
+
+    def table(title: str, row_name: str) -> "Table":
+        success = ("success",) if with_success else ()
+        columns = (row_name, "uniform", "oracle", "adapted", "other", score, *success)
+        return make_table(title, columns=columns, long_text=(row_name,))
+
+    blocks = []
+    means = table(f"{run}: means over {len(first.tasks)} test tasks", "protocol")
+    for result in results:
+        name = f"protocol {result.protocol}" if len(results) > 1 else f"{run}, {result.protocol}"
+        block = table(f"{name}: returns by test task", "task")
+        rows = [_values(task, score, with_success=with_success) for task in result.tasks]
+        mean = [number(_mean(column)) for column in zip(*rows, strict=True)]
+        for task, values in zip(result.tasks, rows, strict=True):
+            block.add_row(str(task.task), *map(number, values))
+        block.add_section()
+        block.add_row("mean", *mean)
+        blocks.append(block)
+        means.add_row(result.protocol, *mean)
+    return [means, *blocks] if len(results) > 1 else blocks
+
+
+def _values(task: "TaskResult", score: str, *, with_success: bool) -> list[float | None]:
+    values = [task.random, task.oracle, task.final, task.shuffled]
+    values.append(task.regret if score == "regret" else task.normalized)
+    return [*values, task.success] if with_success else values
 
 
 def _score(results: Sequence["Evaluation"]) -> str:
     """What is said of a return: how far it is from the oracle where there is one."""
-    tasks = [task for each in results for task in each.tasks]
+    tasks = [task for result in results for task in result.tasks]
     return "regret" if any(task.regret is not None for task in tasks) else "normalized"
 
 
+def _with_success(results: Sequence["Evaluation"]) -> bool:
+    return any(task.success is not None for result in results for task in result.tasks)
+
+
 def _mean(values: Sequence[float | None]) -> float | None:
-    known = [each for each in values if each is not None]
+    known = [value for value in values if value is not None]
     return sum(known) / len(known) if known and len(known) == len(values) else None
 
 
@@ -63,8 +76,9 @@ def _mean(values: Sequence[float | None]) -> float | None:
 @click.argument("run_folder", metavar="RUN", type=click.Path(path_type=Path))
 @click.option(
     "--protocol",
-    type=click.Choice([*get_args(Protocol), "all"]),
-    help="How to adapt; the recipe's choice if left out. `all` runs the three and compares them.",
+    metavar="NAME",
+    help=f"How to adapt: {', '.join(declared_names('tcmrl.protocols'))}, or {ALL} to compare them; "
+    "the recipe's choice if left out.",
 )
 @click.option(
     "--dataset",
@@ -77,7 +91,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 @output_options
 def evaluate(
     run_folder: Path,
-    protocol: Protocol | Literal["all"] | None,
+    protocol: str | None,
     dataset: Path | None,
     episodes: int | None,
     as_json: bool,
@@ -85,13 +99,10 @@ def evaluate(
 ) -> None:
     """Adapt the policy in RUN to the test tasks, and score it beside its controls.
 
-    \b
-    paper    uniform actions first, then the policy, its context growing by episode
-    offline  contexts from the test tasks' stored trajectories
-    idaq     contexts of training tasks first; the best-return episode's is kept
+    A protocol says which trajectories adapt the policy: its own, stored ones, or other tasks' first.
 
     Controls: uniform actions, the oracle, and other tasks' contexts. Returns are undiscounted.
-    With --protocol all, --json prints a list of the three documents.
+    With --protocol all, --json prints a list of documents.
 
     \b
     Examples:
@@ -100,21 +111,30 @@ def evaluate(
     """
     from tcmrl_algo import evaluate_run
 
-    chosen: Sequence[Protocol | None] = get_args(Protocol) if protocol == "all" else [protocol]
-    results = []
     with StageProgress(quiet=quiet) as progress:
-        for each in chosen:
-            label = f"{each} " if each else ""
+        results = []
+        for name in _protocols(progress) if protocol == ALL else [protocol]:
 
-            def show(stage: str, done: int, total: int, label: str = label) -> None:
-                progress.update(label + stage, done=done, total=total, unit="episodes")
+            def show(stage: str, done: int, total: int, name: str | None = name) -> None:
+                label = f"{name} {stage}" if name else stage
+                progress.update(label, done=done, total=total, unit="episodes")
 
             results.append(
-                evaluate_run(run_folder, protocol=each, dataset_path=dataset, episodes=episodes, report=show)
+                evaluate_run(run_folder, protocol=name, dataset_path=dataset, episodes=episodes, report=show)
             )
     if as_json:
-        documents = [each.to_json() for each in results]
-        print_json(documents if protocol == "all" else documents[0])
+        documents = [result.to_json() for result in results]
+        print_json(documents if protocol == ALL else documents[0])
         return
-    print_table(score_table(results))
+    for table in score_tables(results):
+        print_table(table)
     remark(f"{OTHER}; {SCORES[_score(results)]}", quiet=quiet)
+
+
+def _protocols(progress: StageProgress) -> list[str]:
+    """Every protocol that can be used; says which cannot, and why."""
+    from tcmrl_algo import PROTOCOLS
+
+    for error in PROTOCOLS.broken().values():
+        progress.note(f"left out: {error}")
+    return list(PROTOCOLS.working())

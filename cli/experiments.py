@@ -99,7 +99,8 @@ def experiment(
         print_json(_document(report))
     else:
         for environment in dict.fromkeys(each.environment for each in report.results):
-            print_table(_table(environment, report.results))
+            for table in result_tables(environment, report.results):
+                print_table(table)
         ran = len(report.results) - report.present
         click.echo(
             f"{report.out}: {ran} runs done, {report.present} were there, in {duration(report.seconds)}"
@@ -134,27 +135,26 @@ def _document(report: "ExperimentReport") -> dict[str, Any]:
     }
 
 
-def _table(environment: str, results: Sequence["RunResult"]) -> "Table":
-    """One row per method: under each protocol what it reaches across seeds, and under others' contexts."""
+def result_tables(environment: str, results: Sequence["RunResult"]) -> list["Table"]:
+    """One table per protocol: what every method reaches across seeds, and under others' contexts."""
     from tcmrl_algo import summarize
 
-    here = [each for each in results if each.environment == environment]
-    protocols = list(here[0].evaluations)
-    columns = ["method", "seeds"]
-    columns += [
-        f"{protocol}\n{part}" for protocol in protocols for part in ("mean", "95%", "other", "regret")
-    ]
-    table = make_table(f"{environment}: returns on the test tasks", columns=columns, text=("method",))
-    for method in dict.fromkeys(each.method for each in here):
-        rows = [row for each in here if each.method == method for row in each.rows()]
-        cells = []
-        for protocol in protocols:
+    here = [result for result in results if result.environment == environment]
+    columns = ("method", "seeds", "mean", "95%", "other", "regret")
+    tables = []
+    for protocol in here[0].evaluations:
+        title = f"{environment}, protocol {protocol}: returns on the test tasks"
+        table = make_table(title, columns=columns, long_text=("method",))
+        for method in dict.fromkeys(result.method for result in here):
+            rows = [row for result in here if result.method == method for row in result.rows()]
             chosen = [row for row in rows if row["protocol"] == protocol]
             final = summarize([row["final"] for row in chosen])
             interval = "–" if final.low is None else f"{number(final.low)} to {number(final.high)}"
             other = summarize([row["shuffled"] for row in chosen]).mean
             regrets = [row["regret"] for row in chosen]
             regret = None if None in regrets else summarize(regrets).mean
-            cells += [number(final.mean), interval, number(other), number(regret)]
-        table.add_row(method, str(len(rows) // len(protocols)), *cells)
-    return table
+            table.add_row(
+                method, str(len(chosen)), number(final.mean), interval, number(other), number(regret)
+            )
+        tables.append(table)
+    return tables

@@ -1,6 +1,10 @@
+from .adaptation.arena import Arena as Arena
 from .adaptation.evaluate import Evaluation as Evaluation
 from .adaptation.evaluate import TaskResult as TaskResult
 from .adaptation.evaluate import evaluate_run as evaluate_run
+from .adaptation.protocols.base import PROTOCOLS as PROTOCOLS
+from .adaptation.protocols.base import Adaptation as Adaptation
+from .adaptation.protocols.base import Protocol as Protocol
 from .context_methods.learner import ContextAlgorithm as ContextAlgorithm
 from .experiment.aggregate import Summary as Summary
 from .experiment.aggregate import summarize as summarize

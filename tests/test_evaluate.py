@@ -1,7 +1,9 @@
-"""Meta-testing: the three protocols, their controls, and `tcmrl evaluate`."""
+"""Meta-testing: the protocols, their controls, and `tcmrl evaluate`."""
 
 import json
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -9,12 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tcmrl_cli.evaluation import score_tables
+from tcmrl_cli.frame import print_table
 from tcmrl_cli.train import tcmrl
 from torch import Tensor
 
-from tcmrl_algo import Evaluation, evaluate_run, resolve, train_run
+from tcmrl_algo import Evaluation, TaskResult, evaluate_run, resolve, train_run
+from tcmrl_algo.adaptation.arena import Arena
 from tcmrl_algo.adaptation.evaluate import contexts_of_others
-from tcmrl_algo.adaptation.protocols import PROTOCOLS, Arena
+from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.methods.problem import Algorithm, Metrics
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_data import (
@@ -26,7 +31,9 @@ from tcmrl_data import (
     TrainingError,
     Trajectory,
 )
-from tests.commands import Call, in_process
+from tests.commands import Call, assert_refused, in_process
+from tests.plugin_packages import install
+from tests.terminal import assert_fits, in_terminal
 
 SMALL = ("batch.transitions=8", "actor_critic.hidden=[8]", "tcmrl.latent=4", "run.episodes=3")
 
@@ -99,11 +106,11 @@ def oracle(dataset: Dataset, task: Task) -> float:
     return found
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
+@pytest.mark.parametrize("protocol", PROTOCOLS.names())
 def test_a_perfect_adapter_reaches_the_oracle_under_every_protocol(two_tests: Dataset, protocol: str) -> None:
     algorithm = GoalReader()
     place = arena(two_tests, algorithm, episodes=5, random_episodes=2)
-    adaptations = PROTOCOLS[protocol](place, two_tests.test_tasks)  # type: ignore[index]
+    adaptations = PROTOCOLS.get(protocol)().adapt(place, two_tests.test_tasks)
     assert len(adaptations) == 2
     for task, adaptation in zip(two_tests.test_tasks, adaptations, strict=True):
         assert len(adaptation.returns) == 5
@@ -113,7 +120,7 @@ def test_a_perfect_adapter_reaches_the_oracle_under_every_protocol(two_tests: Da
 def test_paper_protocol_acts_randomly_first_and_lets_the_context_grow(two_tests: Dataset) -> None:
     algorithm = GoalReader()
     place = arena(two_tests, algorithm, episodes=5, random_episodes=2)
-    adaptations = PROTOCOLS["paper"](place, two_tests.test_tasks)
+    adaptations = PROTOCOLS.get("paper")().adapt(place, two_tests.test_tasks)
     assert algorithm.seen == [[2, 2], [3, 3], [4, 4]]
     for task, adaptation in zip(two_tests.test_tasks, adaptations, strict=True):
         assert max(adaptation.returns[:2]) < oracle(two_tests, task) - 2
@@ -122,7 +129,7 @@ def test_paper_protocol_acts_randomly_first_and_lets_the_context_grow(two_tests:
 
 def test_offline_protocol_draws_stored_trajectories_of_the_task_itself(two_tests: Dataset) -> None:
     place = arena(two_tests, GoalReader(), episodes=3, offline_trajectories=2)
-    adaptations = PROTOCOLS["offline"](place, two_tests.test_tasks)
+    adaptations = PROTOCOLS.get("offline")().adapt(place, two_tests.test_tasks)
     for task, adaptation in zip(two_tests.test_tasks, adaptations, strict=True):
         stored = {
             each.rewards.tobytes() for each in two_tests.select(tasks=[task.index]).trajectories(task.index)
@@ -143,7 +150,7 @@ def test_stored_contexts_come_from_the_snapshots_of_contexts(two_tests: Dataset)
 
 def test_idaq_protocol_tries_training_contexts_and_keeps_the_best(two_tests: Dataset) -> None:
     place = arena(two_tests, GoalReader(), episodes=5)
-    adaptations = PROTOCOLS["idaq"](place, two_tests.test_tasks)
+    adaptations = PROTOCOLS.get("idaq")().adapt(place, two_tests.test_tasks)
     training = [oracle(two_tests, task) for task in two_tests.train_tasks]
     assert len(training) == 3
     for task, adaptation in zip(two_tests.test_tasks, adaptations, strict=True):
@@ -163,7 +170,7 @@ def test_idaq_keeps_a_training_context_that_nothing_beats(two_tests: Dataset) ->
             return GoalController(np.array([goal] * len(trajectories)))
 
     place = arena(two_tests, Stubborn(), episodes=5)
-    adaptations = PROTOCOLS["idaq"](place, two_tests.test_tasks)
+    adaptations = PROTOCOLS.get("idaq")().adapt(place, two_tests.test_tasks)
     first = place.stored(two_tests.train_tasks[0], draw=0)
     for adaptation in adaptations:
         assert adaptation.contexts[0] == first
@@ -177,7 +184,7 @@ def test_idaq_keeps_the_first_of_equal_contexts(two_tests: Dataset) -> None:
 
     place = arena(two_tests, Indifferent(), episodes=5)
     first = place.stored(two_tests.train_tasks[0], draw=0)
-    for adaptation in PROTOCOLS["idaq"](place, two_tests.test_tasks):
+    for adaptation in PROTOCOLS.get("idaq")().adapt(place, two_tests.test_tasks):
         assert len(set(adaptation.returns)) == 1
         assert adaptation.contexts[0] == first
 
@@ -212,12 +219,12 @@ def test_lanes_beyond_one_batch_keep_their_order(two_tests: Dataset, monkeypatch
         return [each.undiscounted_return for each in place.adapted(tasks, contexts, episode=0)]
 
     whole = returns()
-    monkeypatch.setattr("tcmrl_algo.adaptation.protocols.MOST_LANES", 2)
+    monkeypatch.setattr("tcmrl_algo.adaptation.arena.MOST_LANES", 2)
     assert returns() == pytest.approx(whole)
 
 
-@pytest.mark.parametrize("protocol", PROTOCOLS)
-def test_evaluation_repeats_exactly_and_adds_up(trained: Path, tiny: Dataset, protocol: Any) -> None:
+@pytest.mark.parametrize("protocol", PROTOCOLS.names())
+def test_evaluation_repeats_exactly_and_adds_up(trained: Path, tiny: Dataset, protocol: str) -> None:
     first = evaluate_run(trained, protocol=protocol)
     assert first == evaluate_run(trained, protocol=protocol)
     (task,) = first.tasks
@@ -329,14 +336,100 @@ def test_evaluate_command_compares_all_protocols(trained: Path, call: Call) -> N
     for text in ("paper", "adapted", "regret", "other", "uniform", "oracle", "mean"):
         assert text in output
     code, output, _ = call("evaluate", trained, "--protocol", "all", "--json")
-    assert [each["protocol"] for each in json.loads(output)] == ["paper", "offline", "idaq"]
+    assert [each["protocol"] for each in json.loads(output)] == PROTOCOLS.names()
+
+
+def test_evaluations_by_every_protocol_fit_a_terminal_with_every_number_whole(trained: Path) -> None:
+    shown = in_terminal("tcmrl", "evaluate", trained, "--protocol", "all", "--quiet")
+    assert shown.code == 0
+    assert_fits(shown.output)
+    for protocol in PROTOCOLS.names():
+        evaluation = evaluate_run(trained, protocol=protocol)
+        (task,) = evaluation.tasks
+        numbers = [task.random, task.oracle, task.final, task.shuffled, task.regret]
+        row = [f"{value:,.2f}" for value in numbers if value is not None]
+        lines = [line.split() for line in shown.output.splitlines()]
+        assert lines.count([protocol, *row]) == 1  # the means by protocol
+        assert f"protocol {protocol}: returns by test task" in shown.output
+        assert [str(task.task), *row] in lines
+
+
+def test_long_returns_of_twenty_tasks_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    task = TaskResult(
+        task=0, split="test", returns=[], final=-1234.56, oracle=-1023.45, random=-9876.54,
+        regret=1000.0, normalized=0.9, reference="oracle", success=0.25, shuffled=-1234.57,
+    )  # fmt: skip
+    tasks = [replace(task, task=index) for index in range(20)]
+    result = Evaluation("a_method", "walker-rand-params", 10, "offline", tasks, 0.0, None, None, 0.0)
+    for table in score_tables([result, replace(result, protocol="a_new_protocol")]):
+        print_table(table)  # to a pipe: as wide as its columns
+    output = capsys.readouterr().out
+    assert_fits(output)
+    assert output.count("-9,876.54") == 2 + 2 * 21
+
+
+def test_one_protocol_shows_its_tasks_and_their_mean(trained: Path, call: Call) -> None:
+    code, output, _ = call("evaluate", trained, "--protocol", "offline")
+    lines = [line.split() for line in output.splitlines()]
+    assert code == 0
+    assert [line[0] for line in lines if len(line) == 6] == ["task", "3", "mean"]
+    assert "offline: returns by test task" in " ".join(output.split())
+
+
+def test_help_names_the_installed_protocols_without_importing_torch() -> None:
+    code = (
+        "import sys; from tcmrl_cli.train import tcmrl; "
+        "tcmrl(['evaluate', '--help'], standalone_mode=False); assert 'torch' not in sys.modules"
+    )
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert ", ".join(PROTOCOLS.names()) in " ".join(shown.stdout.split())
+
+
+PLUGIN = """
+from tcmrl_algo import Adaptation, Protocol
+
+class Plugin(Protocol):
+    name = "borrowed"
+
+    def adapt(self, arena, tasks):
+        context = arena.stored(arena.dataset.train_tasks[0], draw=0)
+        episodes = arena.adapted(tasks, [context] * len(tasks), episode=0)
+        return [Adaptation([episode.undiscounted_return], [context]) for episode in episodes]
+"""
+
+
+@pytest.fixture
+def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A package of somebody else with a protocol, and another that cannot be imported."""
+    modules = {"borrowed_protocol": PLUGIN, "torn_protocol": "import no_such_module"}
+    lines = "borrowed = borrowed_protocol:Plugin\ntorn = torn_protocol:Plugin"
+    install(tmp_path, "foreign", modules=modules, declares={"tcmrl.protocols": lines})
+    monkeypatch.syspath_prepend(str(tmp_path))
+
+
+@pytest.mark.usefixtures("foreign")
+def test_a_protocol_of_another_package_evaluates_beside_ours(trained: Path, call: Call) -> None:
+    code, output, errors = call("evaluate", trained, "--protocol", "all", "--json")
+    assert code == 0
+    assert [document["protocol"] for document in json.loads(output)] == sorted(
+        ["borrowed", "idaq", "offline", "paper"]
+    )
+    assert "left out: protocol 'torn' of package 'foreign' is broken: ModuleNotFoundError" in errors
+    assert_refused(call("evaluate", trained, "--protocol", "torn"), "'torn'", "no_such_module")
+    assert_refused(call("evaluate", trained, "--protocol", "borowed"), "did you mean borrowed")
+
+
+def test_a_training_table_with_an_unknown_protocol_is_refused(tiny: Dataset) -> None:
+    table = tiny.manifest.training["quick"]
+    with pytest.raises(TrainingError, match=r"here, run.protocol: .*'papr'; did you mean paper\?"):
+        resolve(table, place="here", overrides=["run.protocol=papr"])
 
 
 def test_evaluate_command_refuses_bad_input_in_one_line(trained: Path, tmp_path: Path, call: Call) -> None:
     for arguments, expected in (
         ((tmp_path / "none",), "no run.json"),
         ((trained, "--dataset", tmp_path / "none"), "none"),
-        ((trained, "--protocol", "telepathy"), "telepathy"),
+        ((trained, "--protocol", "oflin"), "unknown protocol 'oflin'; did you mean offline"),
         ((trained, "--episodes", "0"), "--episodes"),
     ):
         code, output, errors = call("evaluate", *arguments)

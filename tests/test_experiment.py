@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tcmrl_cli.experiments import result_tables
+from tcmrl_cli.frame import print_table
 from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
@@ -19,13 +21,16 @@ from tcmrl_algo import experiment_names, load_experiment, open_run, run_experime
 from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.driver import Finished
 from tcmrl_algo.experiment.plan import resolve_method
-from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.experiment.results import RunResult, read_results
 from tcmrl_data import TcmrlError, TrainingError
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
+from tests.terminal import assert_fits, in_terminal
 from tests.workers import ROOT, marked_pids, wait_for
 
+CLAIM = {"text": "TCMRL ends higher", "better": "TCMRL", "worse": "no context"}
+PARTS = ("final", "shuffled", "regret")
 FILES = {f"point-robot--{method}--seed{seed}" for method in ("tcmrl", "no-context") for seed in (0, 1)}
 
 
@@ -86,6 +91,50 @@ def test_a_second_call_does_nothing_and_says_the_same(
     assert "TCMRL" in output and "0 runs done, 4 were there" in output
 
 
+def test_tables_by_protocol_fit_a_terminal_with_every_number_whole(
+    finished: Path, tiny_folder: Path, tmp_path: Path
+) -> None:
+    file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
+    shown = in_terminal("tcmrl", "experiment", file, "--out", finished)
+    tables = shown.output[: shown.output.index(str(finished))]  # a line of words wraps, nothing is lost
+    assert_fits(tables)
+    lines = [line.split() for line in tables.splitlines()]
+    for protocol in ("offline", "paper"):
+        assert f"point-robot, protocol {protocol}: returns" in tables
+        results = read_results(finished, _small(tiny_folder))
+        rows = [row for result in results for row in result.rows() if row["protocol"] == protocol]
+        for method in ("TCMRL", "no context"):
+            values = [[row[part] for row in rows if row["method"] == method] for part in PARTS]
+            means = [f"{sum(found) / len(found):,.2f}" for found in values]
+            assert [*method.split(), "2", means[0], "–", *means[1:]] in lines
+
+
+def test_long_returns_with_intervals_fit_a_terminal(
+    finished: Path,
+    tiny_folder: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    (result, *_) = read_results(finished, _small(tiny_folder))
+    far = {"mean_final": -1234.56, "mean_shuffled": -5432.1, "mean_regret": 9876.54}
+    runs = [
+        result.model_copy(
+            update={
+                "method": "TCMRL without anything that the paper adds to its predecessors",
+                "seed": seed,
+                "evaluations": {"a_new_protocol": result.evaluations["paper"] | far},
+            }
+        )
+        for seed in range(5)
+    ]
+    (table,) = result_tables("point-robot", runs)
+    monkeypatch.setattr("tcmrl_cli.frame.PIPE_WIDTH", 80)
+    print_table(table)
+    output = capsys.readouterr().out
+    assert_fits(output)
+    assert "-1,234.56 to -1,234.56" in output and "9,876.54" in output
+
+
 def test_other_settings_or_data_are_refused_by_name(
     finished: Path, tiny_folder: Path, tiny_copy: Callable[[], Path], tmp_path: Path, call: Call
 ) -> None:
@@ -137,7 +186,8 @@ def test_only_and_seeds_choose_runs_and_the_table_keeps_the_rest(
         ({"sedes": [0]}, ["sedes"]),
         ({"seeds": [0, 0]}, ["seeds", "distinct"]),
         ({"seeds": []}, ["seeds"]),
-        ({"protocols": ["ofline"]}, ["protocols", "ofline"]),
+        ({"protocols": ["ofline"], "claims": []}, ["protocols", "'ofline'; did you mean offline"]),
+        ({"claims": [CLAIM | {"protocol": "idaq"}]}, ["'idaq' is not evaluated", "offline, paper"]),
         ({"name": "../up"}, ["name"]),
         ({"schema": 2}, ["schema"]),
         ({"curve_points": 41}, ["41", "40"]),

@@ -10,8 +10,9 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from tcmrl_algo.adaptation.protocols import PROTOCOLS, Adaptation, Arena, Context, Report, ignore_progress
-from tcmrl_algo.settings.run import Protocol, RunSettings
+from tcmrl_algo.adaptation.arena import Arena, Context, ProgressCallback, ignore_progress
+from tcmrl_algo.adaptation.protocols.base import PROTOCOLS, Adaptation
+from tcmrl_algo.settings.run import RunSettings
 from tcmrl_algo.training.checkpoint import Run, open_run
 from tcmrl_algo.training.train import create_algorithm
 from tcmrl_data import Dataset, Task, TrainingError, Trajectory, open_dataset
@@ -73,10 +74,10 @@ class Evaluation:
 def evaluate_run(
     run_folder: str | Path,
     *,
-    protocol: Protocol | None = None,
+    protocol: str | None = None,
     dataset_path: str | Path | None = None,
     episodes: int | None = None,
-    report: Report = ignore_progress,
+    report: ProgressCallback = ignore_progress,
 ) -> Evaluation:
     """Evaluates the newest checkpoint of a run.
 
@@ -90,6 +91,7 @@ def evaluate_run(
     Raises:
         CheckpointError: no run, no checkpoint, or another dataset than the run was trained on.
         TrainingError: the dataset holds no test task.
+        UnknownNameError: no such protocol; the message lists the nearest names.
 
     Example:
         >>> evaluation = evaluate_run("runs/point-robot-tcmrl-seed0", protocol="idaq")  # doctest: +SKIP
@@ -106,9 +108,10 @@ def evaluate_run(
 
 
 def evaluate_open_run(
-    run: Run, dataset: Dataset, settings: RunSettings, *, report: Report = ignore_progress
+    run: Run, dataset: Dataset, settings: RunSettings, *, report: ProgressCallback = ignore_progress
 ) -> Evaluation:
     """As `evaluate_run`, for what is already open; `settings` may differ from the run's own."""
+    protocol = PROTOCOLS.get(settings.protocol)()
     tasks = dataset.test_tasks
     if not tasks:
         raise TrainingError(f"{dataset.folder} holds no test task; build one with `tcmrl-data build --tasks`")
@@ -118,7 +121,7 @@ def evaluate_open_run(
     arena = Arena(dataset, algorithm, settings, seed=run.record.seed, report=report)
     try:
         arena.begin("adaptation", len(tasks) * settings.episodes)
-        adaptations = PROTOCOLS[settings.protocol](arena, tasks)
+        adaptations = protocol.adapt(arena, tasks)
         results = _results(arena, tasks, adaptations)
     finally:
         arena.close()

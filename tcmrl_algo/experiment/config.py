@@ -7,11 +7,10 @@ import tomllib
 from collections.abc import Iterator, Mapping
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_algo.settings.run import Protocol
 from tcmrl_data import TrainingError
 from tcmrl_data.foundation.validation import validate_table
 
@@ -76,7 +75,7 @@ class Claim(_Table):
     worse: str
     metric: Metric = "final"
     against: Metric | None = None
-    protocol: Protocol | None = None
+    protocol: str | None = None
 
 
 class Experiment(_Table):
@@ -103,7 +102,7 @@ class Experiment(_Table):
     environments: dict[str, EnvironmentChoice] = Field(min_length=1)
     methods: dict[str, Method] = Field(min_length=1)
     training: dict[str, Any] = {}
-    protocols: tuple[Protocol, ...] = Field(default=get_args(Protocol), min_length=1)
+    protocols: tuple[str, ...] = Field(default=("paper",), min_length=1)
     curve_points: int = Field(default=5, ge=1)
     claims: tuple[Claim, ...] = ()
 
@@ -121,7 +120,10 @@ class Experiment(_Table):
                     known = ", ".join(map(repr, self.methods))
                     raise ValueError(f"claim {claim.text!r} names no method {label!r}; they are {known}")
             if claim.protocol not in (None, *self.protocols):
-                raise ValueError(f"claim {claim.text!r}: protocol {claim.protocol!r} is not evaluated")
+                raise ValueError(
+                    f"claim {claim.text!r}: protocol {claim.protocol!r} is not evaluated; "
+                    f"protocols are {', '.join(self.protocols)}"
+                )
         return self
 
     def to_json(self) -> dict[str, Any]:

@@ -15,7 +15,6 @@ from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.adaptation.evaluate import Evaluation, evaluate_run
 from tcmrl_algo.experiment.results import CurvePoint, RunResult, result_file
-from tcmrl_algo.settings.run import Protocol
 from tcmrl_algo.training.checkpoint import digest, open_run
 from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_algo.training.train import Progress, resume_run, train_run
@@ -52,7 +51,7 @@ class Job(BaseModel):
     identity: dict[str, Any]
     config: TrainingConfig
     device: str
-    protocols: tuple[Protocol, ...]
+    protocols: tuple[str, ...]
     curve_points: int
 
     def points(self) -> list[int]:

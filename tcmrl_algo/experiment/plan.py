@@ -5,9 +5,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.experiment.config import EnvironmentChoice, Experiment, override_texts, run_id
 from tcmrl_algo.training.config import TrainingConfig, resolve
-from tcmrl_data import CheckpointError, Dataset, SelectionError, TrainingError, open_dataset
+from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError, open_dataset
 
 
 @dataclass(frozen=True)
@@ -65,8 +66,9 @@ def plan_runs(
     Raises:
         SelectionError: a dataset is missing, of another environment, without test tasks, or without the
             snapshots that a method asks for.
-        TrainingError: an unknown method, algorithm or profile, or changes that do not validate.
+        TrainingError: an unknown method, algorithm, profile or protocol, or changes that do not validate.
     """
+    _check_protocols(experiment)
     runs = []
     for environment, choice in experiment.environments.items():
         dataset = _dataset(environment, choice, data)
@@ -104,6 +106,14 @@ def check_same(done: Mapping[str, Any], planned: Mapping[str, Any], *, place: Pa
                 f"{place} was made with {key} {before.get(key)!r}, this experiment asks for "
                 f"{now.get(key)!r}; choose another --out, or delete that run"
             )
+
+
+def _check_protocols(experiment: Experiment) -> None:
+    for protocol in experiment.protocols:
+        try:
+            PROTOCOLS.get(protocol)
+        except TcmrlError as error:
+            raise TrainingError(f"experiment {experiment.name!r}, protocols: {error}") from None
 
 
 def _dataset(environment: str, choice: EnvironmentChoice, data: Path) -> Dataset:

@@ -4,12 +4,11 @@ import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import get_args
 
 from tcmrl_algo.adaptation.evaluate import evaluate_run
+from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.experiment.config import Experiment, read_experiment, run_id
 from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file
-from tcmrl_algo.settings.run import Protocol
 from tcmrl_algo.training.checkpoint import Run, digest, open_run
 from tcmrl_data import CheckpointError, TrainingError, canonical_json, parse_json
 
@@ -156,7 +155,7 @@ def _are_seeds(runs: Sequence[Run]) -> bool:
 
 def _evaluated(label: str, run: Run) -> RunResult:
     record = run.record
-    documents = {each: evaluate_run(run.folder, protocol=each).to_json() for each in get_args(Protocol)}
+    documents = {name: evaluate_run(run.folder, protocol=name).to_json() for name in PROTOCOLS.working()}
     return RunResult(
         experiment="runs",
         method=label,

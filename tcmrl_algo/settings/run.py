@@ -4,7 +4,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-Protocol = Literal["paper", "offline", "idaq"]
+PROTOCOL_GROUP = "tcmrl.protocols"
+"""The entry point group of protocols, which live in a room above this one."""
 
 
 class RunSettings(BaseModel):
@@ -39,7 +40,7 @@ class RunSettings(BaseModel):
     precision: Literal["float32", "bfloat16"] = "float32"
     log_every: int = Field(default=100, ge=1)
     checkpoint_every: int = Field(default=5_000, ge=1)
-    protocol: Protocol = "paper"
+    protocol: str = "paper"
     episodes: int = Field(default=10, ge=1)
     random_episodes: int = Field(default=2, ge=1)
     offline_trajectories: int = Field(default=4, ge=1)

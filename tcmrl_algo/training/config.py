@@ -5,8 +5,11 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict
 
+from tcmrl_algo.settings.run import PROTOCOL_GROUP
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import TcmrlError, TrainingError, apply_overrides, plugin
+from tcmrl_data.foundation.errors import UnknownNameError
+from tcmrl_data.foundation.plugins import check_declared
 from tcmrl_data.foundation.validation import validate_table
 
 ALGORITHMS = "tcmrl_algo.algorithms"
@@ -38,7 +41,7 @@ def resolve(
         overrides: `section.key=value` texts, applied last.
 
     Raises:
-        TrainingError: an unknown key or a wrong type.
+        TrainingError: an unknown key, a wrong type or an unknown protocol.
         TcmrlError: no such algorithm.
     """
     tables = apply_overrides(table, overrides)
@@ -47,12 +50,20 @@ def resolve(
         tables["run"] = {**run, "algorithm": algorithm}
     shared = {name: tables.pop(name) for name in TrainingSettings.model_fields if name in tables}
     settings = validate_table(TrainingSettings, shared, place=place, error=TrainingError)
+    _check_protocol(settings.run.protocol, place)
     kind: type[BaseModel] = plugin(ALGORITHMS, "algorithm", settings.run.algorithm).Config
     for name in sorted(tables):
         _check_method_table(name, place)
     name = settings.run.algorithm
     method = validate_table(kind, tables.get(name, {}), place=place, error=TrainingError, table=name)
     return TrainingConfig(settings=settings, method=method.model_dump(mode="json"))
+
+
+def _check_protocol(name: str, place: str) -> None:
+    try:
+        check_declared(PROTOCOL_GROUP, "protocol", name)
+    except UnknownNameError as error:
+        raise TrainingError(f"{place}, run.protocol: {error}") from None
 
 
 def _check_method_table(name: str, place: str) -> None:

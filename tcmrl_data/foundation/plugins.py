@@ -111,6 +111,19 @@ def declared_names(group: str) -> list[str]:
     return sorted({entry.name for entry in _declared(group, tuple(sys.path))})
 
 
+def check_declared(group: str, noun: str, name: str) -> None:
+    """Refuses a name that no installed package declares in an entry point group; imports no plug-in.
+
+    For settings, which stand in a room below the base class of the plug-ins that they name.
+
+    Raises:
+        UnknownNameError: lists the nearest names.
+    """
+    names = declared_names(group)
+    if name not in names:
+        raise unknown_name(noun, name, names)
+
+
 def _package(entry: EntryPoint) -> str:
     return repr(entry.dist.name if entry.dist else "unknown")
 

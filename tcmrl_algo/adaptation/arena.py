@@ -1,13 +1,10 @@
-"""Three protocols of adaptation to test tasks; each ends in the trajectories that adapt the final policy."""
+"""Where protocols adapt: episodes of test tasks, and stored trajectories."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import final
 
-import numpy as np
-
 from tcmrl_algo.methods.problem import Algorithm
-from tcmrl_algo.settings.run import Protocol, RunSettings
+from tcmrl_algo.settings.run import RunSettings
 from tcmrl_data import (
     Controller,
     Dataset,
@@ -24,25 +21,14 @@ MOST_LANES = 50
 """Episodes stepped together; as many Meta-World lanes take 1 GB and 8 s to make."""
 
 Context = Sequence[Trajectory]
-Report = Callable[[str, int, int], None]
+"""Trajectories that a policy is adapted by; none stands for the prior of a method that has one."""
+
+ProgressCallback = Callable[[str, int, int], None]
 """Called with a stage, episodes done and episodes to do."""
 
 
 def ignore_progress(stage: str, done: int, total: int) -> None:
-    """Reports nothing."""
-
-
-@dataclass(frozen=True)
-class Adaptation:
-    """How one test task was adapted to.
-
-    Attributes:
-        returns: undiscounted return of each adaptation episode.
-        contexts: what the final policy may be adapted by; several where the protocol draws several.
-    """
-
-    returns: list[float]
-    contexts: list[Context]
+    """ProgressCallbacks nothing."""
 
 
 @final
@@ -64,7 +50,7 @@ class Arena:
         settings: RunSettings,
         *,
         seed: int,
-        report: Report = ignore_progress,
+        report: ProgressCallback = ignore_progress,
     ) -> None:
         self.dataset, self.settings = dataset, settings
         self._algorithm, self._seed, self._report = algorithm, seed, report
@@ -139,65 +125,3 @@ class Arena:
         self._done += len(tasks)
         self._report(self._stage, self._done, self._total)
         return trajectories
-
-
-def adapt_paper(arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
-    """The paper's protocol (section 4.2): random episodes, then the policy under a growing context.
-
-    Deviation: the policy acts by its most likely action in the second stage too, without noise.
-    """
-    settings = arena.settings
-    num_random = min(settings.random_episodes, settings.episodes)
-    collected: list[list[Trajectory]] = [[] for _ in tasks]
-    for episode in range(settings.episodes):
-        if episode < num_random:
-            trajectories = arena.explored(tasks, collected, episode=episode)
-        else:
-            trajectories = arena.adapted(tasks, collected, episode=episode)
-        for lane, trajectory in zip(collected, trajectories, strict=True):
-            lane.append(trajectory)
-    return [Adaptation([each.undiscounted_return for each in lane], [lane]) for lane in collected]
-
-
-def adapt_offline(arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
-    """Contexts from the test tasks' stored trajectories, drawn anew for every episode."""
-    draws = range(arena.settings.episodes)
-    contexts = [[arena.stored(task, draw=draw) for draw in draws] for task in tasks]
-    episodes = [arena.adapted(tasks, [lane[draw] for lane in contexts], episode=draw) for draw in draws]
-    return [
-        Adaptation([episode[lane].undiscounted_return for episode in episodes], contexts[lane])
-        for lane in range(len(tasks))
-    ]
-
-
-def adapt_idaq(arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
-    """IDAQ's protocol: training tasks' contexts are tried first, the best-return episode's is kept.
-
-    Four fifths of the episodes each try the context of one training task, evenly spaced among them. The
-    rest try the context that the best episode so far itself shows, and keep it where it does better.
-    """
-    training, episodes = arena.dataset.train_tasks, arena.settings.episodes
-    num_tried = min(len(training), max(1, episodes - max(1, episodes // 5)))
-    chosen = np.linspace(0, len(training) - 1, num_tried).round().astype(int)
-    candidates: list[Context] = [arena.stored(training[index], draw=0) for index in chosen]
-    returns: list[list[float]] = [[] for _ in tasks]
-    kept: list[Context] = [candidates[0] for _ in tasks]
-    best: list[Trajectory | None] = [None for _ in tasks]
-    for episode in range(episodes):
-        if episode < num_tried:
-            tried: list[Context] = [candidates[episode]] * len(tasks)
-        else:
-            tried = [[trajectory] if trajectory else [] for trajectory in best]
-        trajectories = arena.adapted(tasks, tried, episode=episode)
-        for lane, trajectory in enumerate(trajectories):
-            if trajectory.undiscounted_return > max(returns[lane], default=-np.inf):
-                kept[lane], best[lane] = tried[lane], trajectory
-            returns[lane].append(trajectory.undiscounted_return)
-    return [Adaptation(returns[lane], [kept[lane]]) for lane in range(len(tasks))]
-
-
-PROTOCOLS: dict[Protocol, Callable[[Arena, Sequence[Task]], list[Adaptation]]] = {
-    "paper": adapt_paper,
-    "offline": adapt_offline,
-    "idaq": adapt_idaq,
-}

@@ -1,0 +1,34 @@
+"""The paper's protocol (section 4.2)."""
+
+from collections.abc import Sequence
+from typing import final
+
+from tcmrl_algo.adaptation.arena import Arena
+from tcmrl_algo.adaptation.protocols.base import Adaptation, Protocol
+from tcmrl_data import Task, Trajectory
+
+
+@final
+class PaperProtocol(Protocol):
+    """Random episodes first, then the policy under a context that grows by every episode.
+
+    Deviation: the policy acts by its most likely action in the second stage too, without noise. With
+    `random_episodes = 0` a method that needs no trajectories acts by its prior first.
+    """
+
+    name = "paper"
+
+    def adapt(self, arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
+        settings = arena.settings
+        num_random = min(settings.random_episodes, settings.episodes)
+        collected: list[list[Trajectory]] = [[] for _ in tasks]
+        for episode in range(settings.episodes):
+            if episode < num_random:
+                trajectories = arena.explored(tasks, collected, episode=episode)
+            else:
+                trajectories = arena.adapted(tasks, collected, episode=episode)
+            for lane, trajectory in zip(collected, trajectories, strict=True):
+                lane.append(trajectory)
+        return [
+            Adaptation([trajectory.undiscounted_return for trajectory in lane], [lane]) for lane in collected
+        ]
