@@ -46,7 +46,7 @@ def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recomp
       tcmrl-data inspect returns data/point-robot --recompute --json
     """
     import tcmrl_data
-    from tcmrl_data.dataset.returns import first_disagreement, plot_returns, summarize
+    from tcmrl_data.dataset.returns import first_disagreement, plot_returns, summarize_returns
 
     opened = tcmrl_data.open_dataset(dataset)
     table = tcmrl_data.return_table(opened, recompute=recompute)
@@ -56,7 +56,7 @@ def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recomp
     if as_json:
         print_json(table)
     else:
-        _print_returns(table["name"], summarize(table))
+        _print_returns(table["name"], summarize_returns(table))
     if recompute:
         difference = first_disagreement(tcmrl_data.return_table(opened), table)
         if difference is not None:

@@ -19,6 +19,7 @@ from tcmrl_data.foundation.errors import MissingPackageError, SelectionError, St
 from tcmrl_data.interchange.formats.minari import MinariFormat
 from tcmrl_data.interchange.views.sb3_buffer import to_sb3_buffer
 from tcmrl_data.interchange.views.tensordict import to_tensordict, view_steps
+from tcmrl_data.interchange.views.torch_dataset import TrajectoryDataset
 from tests.conftest import TASKS
 
 
@@ -57,7 +58,7 @@ def episodes_of(selection: Selection) -> list[tuple[int, Trajectory]]:
 
 def test_torch_dataset_serves_every_episode_in_order(tiny: Dataset, uneven: None) -> None:
     selection = tiny.select(split="train", snapshots="steps>=100")
-    served = tiny.to_torch_dataset(split="train", snapshots="steps>=100")
+    served = TrajectoryDataset(selection)
     expected = episodes_of(selection)
     assert len(served) == len(expected) == 4 * 2 * 6
     for index, (task, trajectory) in enumerate(expected):
@@ -74,7 +75,7 @@ def test_torch_dataset_serves_every_episode_in_order(tiny: Dataset, uneven: None
 
 
 def test_torch_dataset_items_are_the_users_own(tiny: Dataset) -> None:
-    served = tiny.to_torch_dataset(tasks=[0])
+    served = TrajectoryDataset(tiny.select(tasks=[0]))
     served[0]["observations"].zero_()
     assert served[0]["observations"].abs().sum() > 0
 
@@ -91,7 +92,7 @@ def test_torch_dataset_reads_lazily_and_keeps_what_it_may(
         return original(self, task, step)
 
     monkeypatch.setattr(Dataset, "trajectories", count)
-    served = tiny.to_torch_dataset(tasks=[40], kept_parts=kept_parts)
+    served = TrajectoryDataset(tiny.select(tasks=[40]), kept_parts=kept_parts)
     assert (len(served), read) == (18, [])
     for _ in range(2):
         for index in range(18):
@@ -100,7 +101,7 @@ def test_torch_dataset_reads_lazily_and_keeps_what_it_may(
 
 
 def test_a_loader_with_a_worker_pads_to_the_longest(tiny: Dataset, uneven: None) -> None:
-    served = tiny.to_torch_dataset(tasks=[40], snapshots="last")
+    served = TrajectoryDataset(tiny.select(tasks=[40], snapshots="last"))
     pickle.loads(pickle.dumps(served))  # a worker that is spawned gets it so
     (batch,) = DataLoader(served, batch_size=6, collate_fn=served.collate, num_workers=1)
     assert batch["observations"].shape == (6, 21, 2)

@@ -6,7 +6,7 @@ import pytest
 
 from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
-from tcmrl_data.behavior.checkpoints import Checkpoint, CheckpointFolder
+from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.build.unit import behavior_source
 from tcmrl_data.foundation.disk import CHECKPOINTS
@@ -80,7 +80,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
 @pytest.fixture
 def saved(tmp_path: Path) -> Callable[[], Path]:
     def save() -> Path:
-        folder(tmp_path).save(Checkpoint({"steps": 10}, {"weights": np.arange(4.0)}))
+        folder(tmp_path).save(TrainingState({"steps": 10}, {"weights": np.arange(4.0)}))
         return tmp_path
 
     return save
@@ -98,7 +98,7 @@ def test_a_checkpoint_comes_back(saved: Callable[[], Path]) -> None:
 
 def test_the_last_one_replaces_the_others(saved: Callable[[], Path]) -> None:
     dataset = saved()
-    folder(dataset).save(Checkpoint({"steps": 20}, {"weights": np.zeros(2)}))
+    folder(dataset).save(TrainingState({"steps": 20}, {"weights": np.zeros(2)}))
     state = folder(dataset).load()
     assert state is not None
     assert state.values["steps"] == 20

@@ -6,7 +6,7 @@ from tcmrl_data.dataset.returns import (
     episode_table,
     first_disagreement,
     snapshot_table,
-    summarize,
+    summarize_returns,
     task_table,
 )
 from tcmrl_data.foundation.errors import SelectionError, TaskError
@@ -46,7 +46,7 @@ def table(success: float | None = None) -> dict[str, object]:
 
 
 def test_summary_is_over_tasks_with_splits_apart() -> None:
-    assert summarize(table()) == [
+    assert summarize_returns(table()) == [
         {
             "step": 0,
             "split": "train",
@@ -81,7 +81,7 @@ def test_summary_is_over_tasks_with_splits_apart() -> None:
             "success_rate": None,
         },
     ]
-    assert {row["success_rate"] for row in summarize(table(0.25))} == {0.25}
+    assert {row["success_rate"] for row in summarize_returns(table(0.25))} == {0.25}
 
 
 def test_a_disagreement_names_task_step_and_field() -> None:

@@ -14,8 +14,8 @@ from torch import Tensor
 from tcmrl_data import load_recipe
 from tcmrl_data.behavior.stacked.learner import (
     Hyperparameters,
+    ReplayBatch,
     StackedSac,
-    Transitions,
     head_gradient,
     sample_policy,
 )
@@ -36,7 +36,7 @@ def learner(num_agents: int, settings: Hyperparameters = SETTINGS, device: torch
     return made
 
 
-def draws(agents: list[int], number: int) -> tuple[Transitions, Tensor]:
+def draws(agents: list[int], number: int) -> tuple[ReplayBatch, Tensor]:
     """Batch and noise number `number` of the given agents; each agent has its own stream."""
     rows = []
     for agent in agents:
@@ -52,7 +52,7 @@ def draws(agents: list[int], number: int) -> tuple[Transitions, Tensor]:
             )
         )
     tensors = [torch.tensor(np.stack(column), dtype=torch.float32) for column in zip(*rows, strict=True)]
-    return Transitions(*tensors[:5]), tensors[5]
+    return ReplayBatch(*tensors[:5]), tensors[5]
 
 
 def test_a_networks_gradients_are_autograds() -> None:
@@ -254,7 +254,7 @@ def test_a_device_computes_the_same() -> None:
     for number in range(20):
         batch, noise = draws([0, 1, 2], number)
         on_cpu.update(batch, noise)
-        on_device.update(Transitions(*(each.cuda() for each in vars(batch).values())), noise.cuda())
+        on_device.update(ReplayBatch(*(each.cuda() for each in vars(batch).values())), noise.cuda())
     torch.testing.assert_close(on_device.actors.parameters.cpu(), on_cpu.actors.parameters, rtol=0, atol=1e-4)
 
 

@@ -19,7 +19,7 @@ from tcmrl_algo.training.checkpoint import digest, open_run
 from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_algo.training.train import Progress, resume_run, train_run
 from tcmrl_data import CheckpointError, Dataset, open_dataset
-from tcmrl_data.engine.worker import Report, serve
+from tcmrl_data.engine.worker import Send, serve
 from tcmrl_data.foundation.records import read_record, write_record
 
 MEANS = ("final", "regret", "normalized", "shuffled")
@@ -68,7 +68,7 @@ class Curve(BaseModel):
     points: tuple[CurvePoint, ...] = ()
 
 
-def run_job(job: Job, report: Report) -> str:
+def run_job(job: Job, report: Send) -> str:
     """Does a run, or what is missing of it; the digest of its tensors.
 
     Raises:
@@ -103,7 +103,7 @@ def run_job(job: Job, report: Report) -> str:
     return result.digest
 
 
-def _train_to(step: int, job: Job, dataset: Dataset, report: Report) -> tuple[int, float]:
+def _train_to(step: int, job: Job, dataset: Dataset, report: Send) -> tuple[int, float]:
     """Trains up to a step; how many steps that took here, and how long."""
     folder = Path(job.folder)
     is_begun = (folder / "run.json").is_file()
@@ -164,7 +164,7 @@ def _peak_memory() -> int:
     return 0
 
 
-def _serve(spec: dict[str, Any], report: Report) -> str:
+def _serve(spec: dict[str, Any], report: Send) -> str:
     return run_job(Job.model_validate(spec), report)
 
 

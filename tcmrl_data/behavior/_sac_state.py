@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.behavior.checkpoints import Checkpoint
+from tcmrl_data.behavior.checkpoints import TrainingState
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
@@ -26,7 +26,7 @@ class Episodes(Protocol):
     episode: int
 
 
-def capture(model: "SAC", episodes: Episodes) -> Checkpoint:
+def capture(model: "SAC", episodes: Episodes) -> TrainingState:
     """The state of a model whose running episode has no step yet."""
     import torch
 
@@ -50,10 +50,10 @@ def capture(model: "SAC", episodes: Episodes) -> Checkpoint:
             "actions": _plain(model.action_space.np_random.bit_generator.state),
         },
     }
-    return Checkpoint(values, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
+    return TrainingState(values, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
-def restore(model: "SAC", episodes: Episodes, checkpoint: Checkpoint) -> int:
+def restore(model: "SAC", episodes: Episodes, checkpoint: TrainingState) -> int:
     """Puts a freshly made model into the checkpoint's state; returns its environment steps."""
     import torch
 

@@ -21,7 +21,7 @@ CHECKPOINT_SHARE = 0.05
 
 
 @dataclass(frozen=True)
-class Checkpoint:
+class TrainingState:
     """State of a training.
 
     Attributes:
@@ -56,7 +56,7 @@ class CheckpointFolder:
         wait = max(self._seconds, self._cost / CHECKPOINT_SHARE) if self._seconds else 0.0
         return time.monotonic() - self._saved >= wait
 
-    def save(self, checkpoint: Checkpoint) -> None:
+    def save(self, checkpoint: TrainingState) -> None:
         """Puts a checkpoint in the place of the last one."""
         from safetensors.numpy import save
 
@@ -70,7 +70,7 @@ class CheckpointFolder:
         self._saved = time.monotonic()
         self._cost = self._saved - began
 
-    def load(self) -> Checkpoint | None:
+    def load(self) -> TrainingState | None:
         """The last checkpoint, or None where there is none to trust."""
         from safetensors import SafetensorError
         from safetensors.numpy import load
@@ -83,7 +83,7 @@ class CheckpointFolder:
                 header_bytes = int.from_bytes(data[:8], "little")
                 state = parse_json(parse_json(data[8 : 8 + header_bytes])["__metadata__"]["state"].encode())
                 if state["key"] == self._key and state["values"]["steps"] < self._before:
-                    return Checkpoint(state["values"], load(data))
+                    return TrainingState(state["values"], load(data))
             except (OSError, ValueError, KeyError, TypeError, SafetensorError):
                 continue
         return None

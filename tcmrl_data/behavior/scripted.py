@@ -6,7 +6,7 @@ from typing import final
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
-from tcmrl_data.behavior.snapshot import ScriptedPolicy, Snapshot
+from tcmrl_data.behavior.snapshot import ScriptedDescription, Snapshot
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
 
@@ -51,4 +51,4 @@ class ScriptedSource(BehaviorSource):
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
         for task in context.tasks:
             for step, noise in enumerate(self.settings.noise):
-                yield task, Snapshot(step, ScriptedPolicy(observation="full", noise=noise))
+                yield task, Snapshot(step, ScriptedDescription(observation="full", noise=noise))

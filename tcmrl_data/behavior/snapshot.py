@@ -37,7 +37,7 @@ class _Description(BaseModel):
     observation: View
 
 
-class GaussianPolicy(_Description):
+class GaussianDescription(_Description):
     """A squashed Gaussian policy with ReLU layers; its weights are in the safetensors file."""
 
     kind: Literal["squashed_gaussian"] = "squashed_gaussian"
@@ -55,15 +55,15 @@ class GaussianPolicy(_Description):
         }
 
 
-class ScriptedPolicy(_Description):
+class ScriptedDescription(_Description):
     """The environment's own expert plus N(0, noise) on every action."""
 
     kind: Literal["scripted"] = "scripted"
     noise: float = Field(ge=0, le=10, allow_inf_nan=False)
 
 
-PolicyDescription = Annotated[GaussianPolicy | ScriptedPolicy, Field(discriminator="kind")]
-_DESCRIPTION: TypeAdapter[GaussianPolicy | ScriptedPolicy] = TypeAdapter(PolicyDescription)
+PolicyDescription = Annotated[GaussianDescription | ScriptedDescription, Field(discriminator="kind")]
+_DESCRIPTION: TypeAdapter[GaussianDescription | ScriptedDescription] = TypeAdapter(PolicyDescription)
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ class Snapshot:
     """
 
     step: int
-    description: GaussianPolicy | ScriptedPolicy
+    description: GaussianDescription | ScriptedDescription
     tensors: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
 
     def digest(self) -> str:
@@ -94,7 +94,7 @@ class Snapshot:
         Raises:
             SnapshotError: a scripted policy for an environment that has no expert.
         """
-        if isinstance(self.description, GaussianPolicy):
+        if isinstance(self.description, GaussianDescription):
             return GaussianController(self.description, self.tensors)
         controller = environment.scripted(parameters, self.description.noise)
         if controller is None:
@@ -125,7 +125,7 @@ def read_snapshot(folder: Path, step: int) -> Snapshot:
         raise SnapshotError(
             f"{folder / 'policy.json'}: not a policy description ({one_line(error)})"
         ) from None
-    if isinstance(description, ScriptedPolicy):
+    if isinstance(description, ScriptedDescription):
         return Snapshot(step, description)
     return Snapshot(step, description, _read_tensors(folder / "policy.safetensors", description.shapes()))
 
@@ -165,7 +165,7 @@ def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
         for name, layer in named.items()
         for kind in ("weight", "bias")
     }
-    description = GaussianPolicy(
+    description = GaussianDescription(
         observation=observation,
         observation_dim=int(tensors["hidden.0.weight"].shape[1]),
         action_dim=int(tensors["mean.weight"].shape[0]),
@@ -226,7 +226,9 @@ def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
 class GaussianController(Controller):
     """tanh(mean + std * noise), computed as Stable-Baselines3's SAC actor computes it."""
 
-    def __init__(self, description: GaussianPolicy, tensors: Mapping[str, npt.NDArray[np.float32]]) -> None:
+    def __init__(
+        self, description: GaussianDescription, tensors: Mapping[str, npt.NDArray[np.float32]]
+    ) -> None:
         import torch
 
         self.view = description.observation

@@ -10,6 +10,7 @@ from typing import Any
 from tcmrl_data.build.driver import Driver
 from tcmrl_data.build.events import EVENTS, BuildEvent, EventLog
 from tcmrl_data.build.part import part_bytes
+from tcmrl_data.build.work_files import check_work_files
 from tcmrl_data.engine.base import ENGINES
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_file, make_folders, remove_abandoned
@@ -18,7 +19,6 @@ from tcmrl_data.foundation.sizes import size
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import DATA_VERSION, MANIFEST, read_manifest
-from tcmrl_data.verification.scan import check_work_files
 
 OWN_FILES = {MANIFEST, LOCK, STAGING, CHECKPOINTS, EVENTS, "zarr.json", "tasks"}
 

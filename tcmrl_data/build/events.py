@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tcmrl_data.foundation.disk import LOCK, lock_holder, named_errors
-from tcmrl_data.store.manifest import MANIFEST, read_manifest
+from tcmrl_data.store.manifest import dataset_folder, read_manifest
 
 EVENTS = "events.jsonl"
 STEPS_SECONDS = 1.0
@@ -106,7 +106,7 @@ def build_status(dataset: Path) -> BuildStatus:
     Raises:
         ManifestError: there is no dataset.
     """
-    folder = dataset.parent if dataset.name == MANIFEST else dataset
+    folder = dataset_folder(dataset)
     manifest = read_manifest(folder)
     builder = lock_holder(folder / LOCK)
     events = _latest_build(folder / EVENTS)

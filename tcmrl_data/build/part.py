@@ -8,7 +8,7 @@ import numpy as np
 
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.build.provenance import provenance
-from tcmrl_data.engine.worker import Report
+from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.base import Environment, Lanes
 from tcmrl_data.envs.controller import Controller, UniformController
 from tcmrl_data.envs.rollout import roll_out
@@ -70,7 +70,7 @@ class PartMaker:
             self._lanes.close()
             self._lanes = None
 
-    def publish(self, snapshot: Snapshot, report: Report) -> str:
+    def publish(self, snapshot: Snapshot, report: Send) -> str:
         """Publishes the part of a snapshot and returns its id.
 
         Args:

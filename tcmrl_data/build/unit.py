@@ -11,7 +11,7 @@ from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorContext, Behavior
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.build.part import PartMaker, part_bytes
 from tcmrl_data.build.provenance import package_versions
-from tcmrl_data.engine.worker import Report
+from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.recipe.recipe import Recipe
@@ -77,7 +77,7 @@ def unit_memory(recipe: Recipe, num_tasks: int) -> int:
     )
 
 
-def run_unit(spec: UnitSpec, report: Report) -> str:
+def run_unit(spec: UnitSpec, report: Send) -> str:
     """Makes every missing part of the unit's tasks; parts already published are left alone.
 
     Returns:
@@ -97,7 +97,7 @@ def run_unit(spec: UnitSpec, report: Report) -> str:
     return digest([read_part_record(folder / "part.json").id for folder in folders.values()])
 
 
-def _make_parts(spec: UnitSpec, source: BehaviorSource, report: Report) -> None:
+def _make_parts(spec: UnitSpec, source: BehaviorSource, report: Send) -> None:
     environment = spec.recipe.make_environment()
     context = BehaviorContext(
         environment=environment,

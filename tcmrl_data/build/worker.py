@@ -3,10 +3,10 @@
 from typing import Any
 
 from tcmrl_data.build.unit import UnitSpec, run_unit
-from tcmrl_data.engine.worker import Report, serve
+from tcmrl_data.engine.worker import Send, serve
 
 
-def _build_parts(spec: dict[str, Any], report: Report) -> str:
+def _build_parts(spec: dict[str, Any], report: Send) -> str:
     import torch
 
     torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently

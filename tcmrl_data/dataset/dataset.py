@@ -23,6 +23,7 @@ from tcmrl_data.store.manifest import (
     Manifest,
     PartRecord,
     TaskReferences,
+    dataset_folder,
     part_folder,
     read_manifest,
     read_sealed_part,
@@ -30,7 +31,7 @@ from tcmrl_data.store.manifest import (
 from tcmrl_data.store.part_files import check_files
 
 if TYPE_CHECKING:
-    from tcmrl_data.interchange.views.torch_dataset import TrajectoryDataset
+    pass
 
 
 def open_dataset(path: str | Path) -> "Dataset":
@@ -47,7 +48,7 @@ def open_dataset(path: str | Path) -> "Dataset":
         >>> dataset = open_dataset("data/point-robot")  # doctest: +SKIP
         >>> dataset.select(split="train", snapshots="last").trajectories(0)  # doctest: +SKIP
     """
-    folder = Path(path).parent if Path(path).name == MANIFEST else Path(path)
+    folder = dataset_folder(path)
     dataset = Dataset(folder, read_manifest(folder))
     layouts: list[ArrayLayout] = []
     stored_bytes = 0
@@ -205,15 +206,3 @@ class Dataset:
         return Selection(
             self, tuple(chosen), {task.index: chosen_steps(self, task.index, snapshots) for task in chosen}
         )
-
-    def to_torch_dataset(
-        self,
-        *,
-        split: Split | None = None,
-        tasks: Sequence[int] | None = None,
-        snapshots: str = "all",
-        kept_parts: int | None = None,
-    ) -> "TrajectoryDataset":
-        """`select(...)`, then `Selection.to_torch_dataset`."""
-        selection = self.select(split=split, tasks=tasks, snapshots=snapshots)
-        return selection.to_torch_dataset(kept_parts=kept_parts)

@@ -123,7 +123,7 @@ def episode_table(dataset: Dataset, *, task: int | None = None, step: int | None
     return _heading(dataset) | {"episodes": rows}
 
 
-def summarize(table: dict[str, Any]) -> list[dict[str, Any]]:
+def summarize_returns(table: dict[str, Any]) -> list[dict[str, Any]]:
     """One row per snapshot step and split: mean, std, min, max over the tasks' mean returns.
 
     Args:
@@ -203,7 +203,7 @@ def _draw_split(axes: "Axes", table: dict[str, Any], split: str, color: str) -> 
         axes.plot(
             steps, [found["mean"] for found in task["snapshots"]], color=color, alpha=0.35, linewidth=0.9
         )
-    rows = [row for row in summarize(table) if row["split"] == split]
+    rows = [row for row in summarize_returns(table) if row["split"] == split]
     if rows:
         label = f"{split}, mean of {len(tasks)} tasks"
         axes.plot(

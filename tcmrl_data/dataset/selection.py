@@ -13,7 +13,6 @@ from tcmrl_data.foundation.errors import SelectionError
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.dataset import Dataset
-    from tcmrl_data.interchange.views.torch_dataset import TrajectoryDataset
     from tcmrl_data.sampling.sampler import BatchSizes, Sampler
 
 
@@ -63,16 +62,6 @@ class Selection:
     dataset: "Dataset"
     tasks: tuple[Task, ...]
     steps: dict[int, tuple[int, ...]]
-
-    def to_torch_dataset(self, *, kept_parts: int | None = None) -> "TrajectoryDataset":
-        """The selected episodes as a map-style `torch.utils.data.Dataset`; parts are read when asked for.
-
-        Args:
-            kept_parts: parts that stay in memory after they were read; all of them where None.
-        """
-        from tcmrl_data.interchange.views.torch_dataset import TrajectoryDataset
-
-        return TrajectoryDataset(self, kept_parts=kept_parts)
 
     def trajectories(self, task: int) -> list[Trajectory]:
         """All selected episodes of a task, snapshot by snapshot."""

@@ -20,7 +20,7 @@ from tcmrl_data.foundation.errors import TcmrlError
 
 REPORT_SECONDS = 0.5
 
-Report = Callable[[Mapping[str, Any]], None]
+Send = Callable[[Mapping[str, Any]], None]
 """Receives a unit's messages; each has a `kind`, and those of kind `steps` a `count` to add up."""
 
 
@@ -59,7 +59,7 @@ def _abandon(signal_number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + signal_number)
 
 
-def serve(work: Callable[[dict[str, Any], Report], str]) -> None:
+def serve(work: Callable[[dict[str, Any], Send], str]) -> None:
     """Makes this process a worker: does the unit whose spec is the first line of standard input.
 
     Args:

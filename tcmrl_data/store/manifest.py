@@ -241,13 +241,19 @@ def part_folder(task: int, step: int) -> str:
     return f"tasks/{task:05d}/snapshots/step_{step:07d}"
 
 
+def dataset_folder(path: str | Path) -> Path:
+    """The folder of a dataset, given the folder or its `manifest.json`."""
+    path = Path(path)
+    return path.parent if path.name == MANIFEST else path
+
+
 def read_manifest(path: Path) -> Manifest:
     """Reads and checks `manifest.json`, given the file or its dataset's folder.
 
     Raises:
         ManifestError: missing, truncated, edited, or of another schema version; names file and field.
     """
-    file = path if path.name == MANIFEST else path / MANIFEST
+    file = dataset_folder(path) / MANIFEST
     try:
         data = read_plain_file(file, limit=MAX_JSON_BYTES)
         values = parse_json(data)

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from tcmrl_data.behavior.snapshot import GaussianPolicy, read_snapshot
+from tcmrl_data.behavior.snapshot import GaussianDescription, read_snapshot
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import draw_tasks
 from tcmrl_data.foundation.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
@@ -122,7 +122,7 @@ def _policy_problems(folder: Path, record: PartRecord, manifest: Manifest | None
     if ("policy.safetensors" in record.files) != bool(snapshot.tensors):
         yield "part.json", "files and policy.json disagree on policy.safetensors"
     environment = None if manifest is None else _environment(manifest)
-    if isinstance(snapshot.description, GaussianPolicy) and isinstance(environment, Environment):
+    if isinstance(snapshot.description, GaussianDescription) and isinstance(environment, Environment):
         sizes = (snapshot.description.observation_dim, snapshot.description.action_dim)
         if sizes != (environment.observation_dim, environment.action_dim):
             yield "policy.json", f"observation_dim and action_dim {sizes} are not the environment's"

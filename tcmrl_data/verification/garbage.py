@@ -4,6 +4,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
+from tcmrl_data.build.work_files import check_work_files
 from tcmrl_data.foundation.disk import (
     CHECKPOINTS,
     LOCK,
@@ -14,9 +15,8 @@ from tcmrl_data.foundation.disk import (
     remove_tree,
 )
 from tcmrl_data.foundation.errors import BuildError, LockedError
-from tcmrl_data.store.manifest import MANIFEST, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, dataset_folder, read_manifest
 from tcmrl_data.verification.repair import REPAIR
-from tcmrl_data.verification.scan import check_work_files
 
 CHECKPOINT = re.compile(r"task_([0-9]{5,10})")
 
@@ -48,7 +48,7 @@ def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage
         LockedError: a process works on the dataset; names it.
         ManifestError: the manifest is damaged, so that nobody knows which tasks are finished.
     """
-    folder = Path(path).parent if Path(path).name == MANIFEST else Path(path)
+    folder = dataset_folder(path)
     if not any((folder / name).exists() for name in (MANIFEST, LOCK, STAGING)):
         raise BuildError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
     check_work_files(folder)

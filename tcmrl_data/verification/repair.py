@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tcmrl_data.build.build import BuildReport, build_dataset
 from tcmrl_data.build.events import BuildEvent
+from tcmrl_data.build.work_files import check_work_files
 from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
@@ -22,8 +23,15 @@ from tcmrl_data.foundation.disk import (
 from tcmrl_data.foundation.errors import NondeterminismError, ReadOnlyError
 from tcmrl_data.foundation.plain_files import folder_problem
 from tcmrl_data.store.layout import GROUP
-from tcmrl_data.store.manifest import MANIFEST, Manifest, part_folder, read_manifest, read_sealed_part, seal
-from tcmrl_data.verification.scan import check_work_files
+from tcmrl_data.store.manifest import (
+    MANIFEST,
+    Manifest,
+    dataset_folder,
+    part_folder,
+    read_manifest,
+    read_sealed_part,
+    seal,
+)
 from tcmrl_data.verification.verify import Finding, Key, VerifyLevel, verify_dataset
 
 REPAIR = "repair"
@@ -76,7 +84,7 @@ def repair_dataset(
         ReadOnlyError: the folder cannot be written, and something is damaged.
         NondeterminismError: a part came out with another id; nothing was replaced.
     """
-    folder = Path(path).parent if Path(path).name == MANIFEST else Path(path)
+    folder = dataset_folder(path)
     manifest = read_manifest(folder)
     check_work_files(folder)
     try:

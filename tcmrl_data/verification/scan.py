@@ -6,14 +6,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.events import EVENTS
-from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
-from tcmrl_data.foundation.errors import BuildError
-from tcmrl_data.foundation.plain_files import file_problem, one_line
-
-WORK_FOLDERS = {STAGING, CHECKPOINTS}
-WORK_FILES = {LOCK, EVENTS}
-"""What a build keeps beside the data: only its kind is looked at."""
+from tcmrl_data.build.work_files import WORK_FILES, WORK_FOLDERS
+from tcmrl_data.foundation.plain_files import one_line
 
 MAX_DEPTH = 10
 """A part's chunks lie 8 folders deep."""
@@ -65,19 +59,3 @@ def scan_dataset(folder: Path) -> Scan:
             elif not is_folder and not (path in WORK_FILES and stat.S_ISREG(status.st_mode)):
                 scan.files[path] = status
     return scan
-
-
-def check_work_files(folder: Path) -> None:
-    """Refuses a dataset whose work files or folders are links, which would lead writing out of it.
-
-    Raises:
-        BuildError: names the file.
-    """
-    for name in sorted(WORK_FILES | WORK_FOLDERS | {"tasks"}):
-        try:
-            status = (folder / name).lstat()
-        except FileNotFoundError:
-            continue
-        is_folder = stat.S_ISDIR(status.st_mode)
-        if (name in WORK_FILES and file_problem(status)) or (name not in WORK_FILES and not is_folder):
-            raise BuildError(f"{folder / name} is not the plain file or folder that a build makes; delete it")

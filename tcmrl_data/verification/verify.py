@@ -27,6 +27,7 @@ from tcmrl_data.store.manifest import (
     PartEntry,
     PartRecord,
     TaskRecord,
+    dataset_folder,
     part_folder,
     read_manifest,
     read_sealed_part,
@@ -104,7 +105,7 @@ def verify_dataset(
         ()
     """
     started = time.monotonic()
-    folder = Path(path).parent if Path(path).name == MANIFEST else Path(path)
+    folder = dataset_folder(path)
     if not folder.is_dir() or not any((folder / name).exists() for name in (MANIFEST, "tasks")):
         raise ManifestError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
     run = _Verification(folder, level, scan_dataset(folder))

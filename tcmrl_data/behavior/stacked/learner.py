@@ -40,7 +40,7 @@ class Hyperparameters:
 
 
 @dataclass(frozen=True)
-class Transitions:
+class ReplayBatch:
     """A batch per task.
 
     Attributes:
@@ -194,7 +194,7 @@ class StackedSac:
         head = self.actors.forward(observations[:, None], self._acting)[:, 0]
         return sample_policy(head, noise).actions
 
-    def update(self, batch: Transitions, noise: Tensor) -> None:
+    def update(self, batch: ReplayBatch, noise: Tensor) -> None:
         """One gradient step of every agent.
 
         Args:
@@ -224,7 +224,7 @@ class StackedSac:
         values = critics.forward(self._critic_inputs, self._critic_outputs)
         return values.view(CRITICS, self.num_agents, -1)
 
-    def _step_critics(self, batch: Transitions, goal: Tensor, log_probs: Tensor) -> None:
+    def _step_critics(self, batch: ReplayBatch, goal: Tensor, log_probs: Tensor) -> None:
         """Critic loss sum_k mean_B((Q_k - goal)^2) / 2, entropy loss -log_entropy mean_B(log pi + target)."""
         values = self._values(self.critics, batch.observations, batch.actions)
         self._critic_deltas[-1].view_as(values).copy_((values - goal) / goal.shape[1])

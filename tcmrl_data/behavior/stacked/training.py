@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from tcmrl_data.behavior.base import BehaviorContext
-from tcmrl_data.behavior.checkpoints import Checkpoint
-from tcmrl_data.behavior.snapshot import GaussianPolicy, Snapshot
-from tcmrl_data.behavior.stacked.learner import Hyperparameters, StackedSac, Transitions
+from tcmrl_data.behavior.checkpoints import TrainingState
+from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
+from tcmrl_data.behavior.stacked.learner import Hyperparameters, ReplayBatch, StackedSac
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 
@@ -109,14 +109,14 @@ class StackedReplay:
         self.rows[:, self.steps_added % capacity] = torch.from_numpy(row).to(self.rows.device)
         self.steps_added += 1
 
-    def gather(self, positions: npt.NDArray[np.int64]) -> Transitions:
+    def gather(self, positions: npt.NDArray[np.int64]) -> ReplayBatch:
         """The transitions at positions (N, B)."""
         num_tasks, capacity, width = self.rows.shape
         flat = positions + capacity * np.arange(num_tasks)[:, None]
         index = torch.from_numpy(flat.reshape(-1)).to(self.rows.device)
         rows = self.rows.view(-1, width).index_select(0, index).view(*positions.shape, width)
         observations, actions, next_observations, rewards, terminated = rows.split(self._splits, dim=-1)
-        return Transitions(
+        return ReplayBatch(
             observations, actions, next_observations, rewards.squeeze(-1), terminated.squeeze(-1)
         )
 
@@ -187,7 +187,7 @@ class GroupTraining:
         noise = np.stack([each.standard_normal(action_dim, dtype=np.float32) for each in self._acting])
         return self.learner.act(self._tensor(observations), self._tensor(noise)).cpu().numpy()
 
-    def _draw(self) -> tuple[Transitions, Tensor]:
+    def _draw(self) -> tuple[ReplayBatch, Tensor]:
         """A batch drawn with replacement, and the noise of one update."""
         batch_size, action_dim = self._settings.batch_size, self._dims[1]
         positions = np.empty((len(self._updating), batch_size), dtype=np.int64)
@@ -207,7 +207,7 @@ class GroupTraining:
         named = {f"hidden.{index}": each for index, each in enumerate(arrays[:-1])}
         (mean_weight, log_std_weight), (mean_bias, log_std_bias) = (np.split(each, 2) for each in arrays[-1])
         named |= {"mean": (mean_weight, mean_bias), "log_std": (log_std_weight, log_std_bias)}
-        description = GaussianPolicy(
+        description = GaussianDescription(
             observation=self._context.observation,
             observation_dim=self._dims[0],
             action_dim=self._dims[1],
@@ -220,7 +220,7 @@ class GroupTraining:
         }
         return Snapshot(self.steps, description, tensors)
 
-    def capture(self) -> Checkpoint:
+    def capture(self) -> TrainingState:
         """Everything that the training depends on, at any step."""
         arrays = {f"learner.{name}": each.cpu().numpy() for name, each in self.learner.state().items()}
         arrays["replay"] = np.ascontiguousarray(self._replay.rows[:, : self._replay.size].cpu().numpy())
@@ -234,9 +234,9 @@ class GroupTraining:
             "acting": [copy.deepcopy(each.bit_generator.state) for each in self._acting],
             "updating": [copy.deepcopy(each.bit_generator.state) for each in self._updating],
         }
-        return Checkpoint(values, arrays)
+        return TrainingState(values, arrays)
 
-    def restore(self, checkpoint: Checkpoint) -> None:
+    def restore(self, checkpoint: TrainingState) -> None:
         """Goes on where a checkpoint was taken, bit for bit."""
         values, arrays = checkpoint.values, checkpoint.arrays
         self.steps = self._replay.steps_added = values["steps"]

@@ -36,7 +36,7 @@ class TrajectoryDataset(Dataset[Item]):
 
     Example:
         >>> from torch.utils.data import DataLoader
-        >>> episodes = dataset.to_torch_dataset(split="train")  # doctest: +SKIP
+        >>> episodes = TrajectoryDataset(dataset.select(split="train"))  # doctest: +SKIP
         >>> DataLoader(episodes, batch_size=16, shuffle=True, collate_fn=episodes.collate)  # doctest: +SKIP
     """
 
