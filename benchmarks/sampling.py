@@ -38,6 +38,7 @@ from _peers import Data, Draw, Work
 from numcodecs.zstd import Zstd
 
 import tcmrl_data
+from tcmrl_data import Trajectories, Transitions, Windows
 
 SIZES = {"half-cheetah-vel": (20, 10, 50), "ml1/reach": (20, 4, 50)}
 """Tasks, snapshots per task, episodes per snapshot: 2 million steps."""
@@ -122,7 +123,13 @@ def _parts(dataset: tcmrl_data.Dataset) -> Iterator[tuple[int, int]]:
 
 def _opening(folder: Path, repeats: int) -> dict[str, list[float]]:
     """Seconds from opening to the first full batch, and for reading and decompressing the same files once."""
-    sizes = tcmrl_data.BatchSizes(tasks=16, windows=32, window_length=10)
+    kinds = {
+        "policy": Transitions(256),
+        "context": Trajectories(1),
+        "execution": Trajectories(1, apart_from="context"),
+        "windows": Windows(32, length=10),
+    }
+    request = tcmrl_data.BatchRequest(tasks=16, kinds=kinds)
     chunks = [path for path in folder.glob("tasks/*/snapshots/*/*/c/**/*") if path.is_file()]
     first_batch: list[float] = []
     reading: list[float] = []
@@ -130,7 +137,7 @@ def _opening(folder: Path, repeats: int) -> dict[str, list[float]]:
         gc.collect()
         started = time.perf_counter()
         selection = tcmrl_data.open_dataset(folder).select(split="train")
-        selection.sampler(sizes, seed=0).batch(0)
+        tcmrl_data.open_sampler(selection, request, seed=0).batch(0)
         first_batch.append(time.perf_counter() - started)
         started = time.perf_counter()
         for chunk in chunks:
@@ -140,24 +147,23 @@ def _opening(folder: Path, repeats: int) -> dict[str, list[float]]:
 
 
 def _our_draws(dataset: tcmrl_data.Dataset, work: Work) -> dict[str, Draw]:
-    """A sampler per kind; `transitions=1` is the least that a batch takes."""
+    """A sampler per kind of batch."""
     selection = dataset.select(split="train")
-    none = {"transitions": 1, "context_trajectories": (0,), "execution_trajectories": 0}
-    wanted: dict[str, dict[str, Any]] = {
-        "transitions": {"transitions": work.transitions},
-        "trajectories": {"context_trajectories": (1,)},
-        "windows": {"windows": work.windows // work.tasks},
+    wanted = {
+        "transitions": {"policy": Transitions(work.transitions)},
+        "trajectories": {"context": Trajectories(1)},
+        "windows": {"windows": Windows(work.windows // work.tasks, length=work.window_length)},
         "full_step": {
-            "transitions": work.transitions,
-            "context_trajectories": (1,),
-            "execution_trajectories": 1,
-            "windows": work.full_windows // work.tasks,
+            "policy": Transitions(work.transitions),
+            "context": Trajectories(1),
+            "execution": Trajectories(1, apart_from="context"),
+            "windows": Windows(work.full_windows // work.tasks, length=work.window_length),
         },
     }
 
     def draw(kind: str) -> Draw:
-        values = none | {"tasks": work.tasks, "window_length": work.window_length} | wanted[kind]
-        sampler = selection.sampler(tcmrl_data.BatchSizes.model_validate(values), seed=0)
+        request = tcmrl_data.BatchRequest(tasks=work.tasks, kinds=wanted[kind])
+        sampler = tcmrl_data.open_sampler(selection, request, seed=0)
         number = iter(range(2**62))
         return lambda: sampler.batch(next(number))
 

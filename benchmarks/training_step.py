@@ -118,13 +118,14 @@ def made_up(sizes: Sizes, algorithm: str, precision: str) -> tuple[ContextAlgori
     module = plugin(ALGORITHMS, "algorithm", algorithm)
     made = module.create(problem, settings, module.Config())
     assert isinstance(made, ContextAlgorithm)
-    parts = (
-        steps(sizes.transitions),
-        steps(sizes.context_trajectories, sizes.horizon),
-        steps(1, sizes.horizon),
-        steps(sizes.windows, 4),
-    )
-    return made, Batch(torch.arange(sizes.tasks), *parts)
+    kinds = {
+        "policy": steps(sizes.transitions),
+        "context": steps(sizes.context_trajectories, sizes.horizon),
+        "execution": steps(1, sizes.horizon),
+    }
+    if sizes.windows:
+        kinds["windows"] = steps(sizes.windows, 4)
+    return made, Batch(torch.arange(sizes.tasks), kinds)
 
 
 def matmul_peak() -> tuple[float, float]:

@@ -45,7 +45,6 @@ from .recipe.recipe import apply_overrides as apply_overrides
 from .recipe.recipe import load_recipe as load_recipe
 from .recipe.tasks import parse_indices as parse_indices
 from .sampling.batch import Batch as Batch
-from .sampling.batch import BatchSizes as BatchSizes
 from .sampling.batch import Moments as Moments
 from .sampling.batch import Steps as Steps
 from .sampling.cache import CacheEntry as CacheEntry
@@ -54,7 +53,12 @@ from .sampling.cache import cache_limit as cache_limit
 from .sampling.cache import clear_cache as clear_cache
 from .sampling.cache import list_cache as list_cache
 from .sampling.prefetch import Prefetch as Prefetch
+from .sampling.request import BatchRequest as BatchRequest
+from .sampling.request import Trajectories as Trajectories
+from .sampling.request import Transitions as Transitions
+from .sampling.request import Windows as Windows
 from .sampling.sampler import Sampler as Sampler
+from .sampling.sampler import open_sampler as open_sampler
 from .store.manifest import Manifest as Manifest
 from .verification.garbage import Garbage as Garbage
 from .verification.garbage import collect_garbage as collect_garbage

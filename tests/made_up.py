@@ -1,5 +1,6 @@
 """A made-up problem, its batches and trajectories: three tasks, observations of 3, actions of 2."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -56,11 +57,17 @@ def steps(*shape: int, seed: int, lengths: tuple[int, ...] | None = None) -> Ste
 def batch(*, lengths: tuple[int, ...] | None = (6, 4, 5), trajectories: int = 2) -> Batch:
     return Batch(
         task_indices=torch.arange(TASKS),
-        transitions=steps(TASKS, 5, seed=1),
-        context=steps(TASKS, trajectories, EPISODE, seed=2, lengths=lengths),
-        execution=steps(TASKS, 1, EPISODE, seed=3, lengths=lengths),
-        windows=steps(TASKS, 0, 2, seed=4),
+        steps={
+            "policy": steps(TASKS, 5, seed=1),
+            "context": steps(TASKS, trajectories, EPISODE, seed=2, lengths=lengths),
+            "execution": steps(TASKS, 1, EPISODE, seed=3, lengths=lengths),
+        },
     )
+
+
+def with_steps(plain: Batch, **steps: Steps) -> Batch:
+    """The batch with other steps for some kinds."""
+    return replace(plain, steps={**plain.steps, **steps})
 
 
 def trajectory(length: int, seed: int) -> Trajectory:

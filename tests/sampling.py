@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from tcmrl_data import BatchSizes, Trajectory
-from tcmrl_data.sampling.rows import Episodes, Rows, fill_rows
+from tcmrl_data import BatchRequest, Trajectory
+from tcmrl_data.sampling.rows import Episodes, PackedRows, fill_rows
 from tcmrl_data.sampling.sampler import Sampler
 from tcmrl_data.store.arrays import pack
 
 
-def rows_of(tasks: Sequence[Sequence[Trajectory]]) -> Rows:
+def rows_of(tasks: Sequence[Sequence[Trajectory]]) -> PackedRows:
     """The packed rows of some tasks' episodes, a part per task."""
     first = tasks[0][0]
     observation_dim, action_dim = first.observations.shape[1], first.actions.shape[1]
@@ -21,14 +21,14 @@ def rows_of(tasks: Sequence[Sequence[Trajectory]]) -> Rows:
         lengths.append(fill_rows(table[start : start + count], pack(task)))
         start += count
     episodes = Episodes.of(lengths, range(len(tasks)))
-    return Rows(table, episodes, observation_dim, action_dim, np.arange(len(tasks)))
+    return PackedRows(table, episodes, observation_dim, action_dim, np.arange(len(tasks)))
 
 
 def sampler_of(
-    tasks: Sequence[Sequence[Trajectory]], sizes: BatchSizes, *, seed: int = 0, stream: int = 0
+    tasks: Sequence[Sequence[Trajectory]], request: BatchRequest, *, seed: int = 0, stream: int = 0
 ) -> Sampler:
     """A sampler over some tasks' episodes."""
-    return Sampler(rows_of(tasks), sizes, seed=seed, stream=stream, environment="memory", place="memory")
+    return Sampler(rows_of(tasks), request, seed=seed, stream=stream, environment="memory", place="memory")
 
 
 def numbered(task: int, episode: int, steps: int) -> Trajectory:

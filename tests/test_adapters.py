@@ -14,7 +14,16 @@ from gymnasium.utils.env_checker import data_equivalence
 from stable_baselines3.common.buffers import ReplayBuffer
 from torch.utils.data import DataLoader
 
-from tcmrl_data import BatchSizes, Dataset, Purpose, Selection, Trajectory, keyed_seed
+from tcmrl_data import (
+    BatchRequest,
+    Dataset,
+    Purpose,
+    Selection,
+    Trajectory,
+    Transitions,
+    keyed_seed,
+    open_sampler,
+)
 from tcmrl_data.foundation.errors import MissingPackageError, SelectionError, StoreError
 from tcmrl_data.interchange.formats.minari import MinariFormat
 from tcmrl_data.interchange.views.sb3_buffer import to_sb3_buffer
@@ -168,8 +177,8 @@ def test_tensordict_holds_every_transition(tiny: Dataset, uneven: None) -> None:
 
 def test_a_batch_is_seen_as_a_tensordict_without_copying(tiny: Dataset) -> None:
     pytest.importorskip("tensordict")
-    sizes = BatchSizes(tasks=3, transitions=7, windows=2)
-    steps = tiny.select(split="train").sampler(sizes, seed=0).batch(0).transitions
+    request = BatchRequest(tasks=3, kinds={"policy": Transitions(7)})
+    steps = open_sampler(tiny.select(split="train"), request, seed=0).batch(0)["policy"]
     view = view_steps(steps)
     assert view.batch_size == torch.Size([3, 7])
     assert view["next", "reward"].shape == view["next", "done"].shape == (3, 7, 1)

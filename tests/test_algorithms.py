@@ -21,9 +21,17 @@ from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.problem import Algorithm
 from tcmrl_algo.networks.optimizer import Adam
 from tcmrl_algo.training.config import ALGORITHMS
-from tcmrl_data import Batch, BatchSizes, Controller, Steps, UniformController
+from tcmrl_data import (
+    Batch,
+    BatchRequest,
+    Controller,
+    Steps,
+    Trajectories,
+    Transitions,
+    UniformController,
+)
 from tcmrl_data.foundation.plugins import modules
-from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, trajectory
+from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, trajectory, with_steps
 
 FOUND = modules(ALGORITHMS)
 BLIND = ("no_context",)
@@ -35,21 +43,26 @@ def make(module: ModuleType, *, seed: int = 0, **actor_critic: Any) -> Algorithm
     return made
 
 
+def request_of(module: ModuleType) -> BatchRequest:
+    made: BatchRequest = module.batch_request(settings(), module.Config())
+    return made
+
+
 def batch_for(module: ModuleType) -> Batch:
-    """What the sampler gives a method that asks for `batch_sizes`: nothing beyond."""
-    sizes = module.batch_sizes(settings())
-    shortened = steps(TASKS, sizes.execution_trajectories, EPISODE, seed=3)
-    trajectories = max(sizes.context_trajectories)
-    return replace(
-        batch(trajectories=trajectories), execution=shortened, windows=steps(TASKS, sizes.windows, 2, seed=4)
-    )
+    """What the sampler gives for the method's request: nothing beyond."""
+    found: dict[str, Steps] = {}
+    for seed, (name, kind) in enumerate(request_of(module).kinds.items()):
+        length = EPISODE if isinstance(kind, Trajectories) else kind.length
+        shape = (TASKS, kind.number) if isinstance(kind, Transitions) else (TASKS, kind.number, length)
+        found[name] = steps(*shape, seed=seed)
+    return Batch(torch.arange(TASKS), found)
 
 
 @every
 def test_a_method_is_one_file_with_four_names(module: ModuleType) -> None:
     assert module.__name__.rpartition(".")[2] == module.NAME
     assert module.Config.model_config == {"frozen": True, "extra": "forbid"}
-    assert isinstance(module.batch_sizes(settings()), BatchSizes)
+    assert isinstance(request_of(module), BatchRequest)
     assert isinstance(make(module), Algorithm)
 
 
@@ -126,9 +139,7 @@ def test_packed_trajectories_keep_their_steps_and_mask_the_rest() -> None:
 
 
 def test_no_context_needs_no_trajectories() -> None:
-    assert no_context.batch_sizes(settings()) == BatchSizes(
-        tasks=TASKS, transitions=5, context_trajectories=(0,), execution_trajectories=0, window_length=2
-    )
+    assert request_of(no_context) == BatchRequest(tasks=TASKS, kinds={"policy": Transitions(5)})
 
 
 def focal_learner() -> ContextLearner:
@@ -141,7 +152,7 @@ def test_focal_pulls_the_means_of_a_tasks_trajectories_together() -> None:
     made, values = focal_learner(), batch()
     assert isinstance(made, focal.FocalLearner)
     found = made.losses(values, 1, torch.Generator())
-    groups = (made.encoder.read(values.context), made.encoder.read(values.execution))
+    groups = (made.encoder.read(values["context"]), made.encoder.read(values["execution"]))
     context, execution = made.encoder(*groups)
     single = torch.stack(
         [
@@ -168,10 +179,10 @@ def test_focal_gathers_each_tasks_contexts() -> None:
         return replace(values, rewards=values.rewards + offset)  # tasks differ in their reward
 
     values = batch(lengths=None)
-    values = replace(values, context=shifted(values.context), execution=shifted(values.execution))
+    values = with_steps(values, context=shifted(values["context"]), execution=shifted(values["execution"]))
 
     def ratio() -> float:
-        parts = (values.context, values.execution)
+        parts = (values["context"], values["execution"])
         contexts = torch.stack([made.learner.context(each) for each in parts]).detach()
         within = (contexts[0] - contexts[1]).norm(dim=-1).mean()
         between = (contexts[0].roll(1, 0) - contexts[1]).norm(dim=-1).mean()
@@ -196,7 +207,7 @@ def test_a_learner_may_collect_and_optimise_in_its_own_way() -> None:
 
         def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
             self.adam.step(self.inner.weight.sum())
-            zero = batch.transitions.rewards.new_zeros(())
+            zero = batch["policy"].rewards.new_zeros(())
             return ContextLosses(zero, zero.new_zeros(TASKS, 0), {})
 
         def context(self, steps: Steps) -> torch.Tensor:

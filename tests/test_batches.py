@@ -6,15 +6,30 @@ import pytest
 import torch
 
 from tcmrl_algo import resolve
-from tcmrl_algo.training.batches import Batches, JoinedBatches, open_batches
-from tcmrl_data import BatchSizes, Dataset, Sampler
+from tcmrl_algo.training.batches import Batches, JoinedBatches, only_transitions, open_batches
+from tcmrl_algo.training.train import batch_request
+from tcmrl_data import (
+    BatchRequest,
+    Dataset,
+    Sampler,
+    Trajectories,
+    Transitions,
+    Windows,
+    open_sampler,
+)
 
 
 def open_with(dataset: Dataset, *overrides: str, algorithm: str = "tcmrl") -> Batches:
     table = dataset.manifest.training["quick"]
     config = resolve(table, place="quick", algorithm=algorithm, overrides=overrides)
     return open_batches(
-        dataset, config, seed=0, device=torch.device("cpu"), memory_limit=None, say=lambda message: None
+        dataset,
+        config.settings.run,
+        batch_request(config),
+        seed=0,
+        device=torch.device("cpu"),
+        memory_limit=None,
+        say=lambda message: None,
     )
 
 
@@ -22,16 +37,24 @@ def test_joined_batches_take_each_kind_from_its_selection(tiny: Dataset) -> None
     last, whole = (tiny.select(split="train", snapshots=each) for each in ("last", "all"))
     stored = [each for task in last.tasks for each in last.trajectories(task.index)]
     own = {float(reward) for each in stored for reward in each.rewards}
-    sizes = BatchSizes(tasks=3, transitions=9, context_trajectories=(1, 2), windows=2)
-    none = sizes.model_copy(update={"context_trajectories": (0,), "execution_trajectories": 0, "windows": 0})
-    joined = JoinedBatches(last.sampler(none, seed=0), whole.sampler(sizes, seed=0))
+    request = BatchRequest(
+        tasks=3,
+        kinds={
+            "policy": Transitions(9),
+            "context": Trajectories((1, 2)),
+            "execution": Trajectories(1, apart_from="context"),
+            "windows": Windows(2, length=2),
+        },
+    )
+    transitions = open_sampler(last, only_transitions(request), seed=0)
+    joined = JoinedBatches(transitions, open_sampler(whole, request, seed=0))
     batches = [joined.batch(n) for n in range(10)]
-    assert all(each.transitions.rewards.shape == (3, 9) for each in batches)
-    assert all(set(each.transitions.rewards.flatten().tolist()) <= own for each in batches)
+    assert all(each["policy"].rewards.shape == (3, 9) for each in batches)
+    assert all(set(each["policy"].rewards.flatten().tolist()) <= own for each in batches)
     for part in ("context", "execution", "windows"):
-        seen = {value for each in batches for value in getattr(each, part).rewards.flatten().tolist()}
+        seen = {value for each in batches for value in each[part].rewards.flatten().tolist()}
         assert not seen <= own, part
-    assert joined.moments().reward_mean == last.sampler(sizes, seed=0).moments().reward_mean
+    assert joined.moments().reward_mean == transitions.moments().reward_mean
 
 
 @pytest.mark.parametrize("rule", ["all", "last"])
@@ -41,13 +64,14 @@ def test_contexts_from_the_same_snapshots_are_those_of_one_selection(tiny: Datas
     assert isinstance(two, JoinedBatches)
     for n in range(70):  # more than one block of draws
         first, second = one.batch(n), two.batch(n)
-        for part in ("transitions", "context", "execution", "windows"):
-            for each in fields(getattr(first, part)):
-                found = [getattr(getattr(batch, part), each.name) for batch in (first, second)]
+        assert set(first.names()) == set(second.names())
+        for part in first.names():
+            for each in fields(first[part]):
+                found = [getattr(batch[part], each.name) for batch in (first, second)]
                 assert torch.equal(*found), (n, part, each.name)
 
 
 def test_an_algorithm_without_contexts_draws_none(tiny: Dataset) -> None:
     alone = open_with(tiny, "run.context_snapshots=last", algorithm="no_context")
     assert isinstance(alone, Sampler)
-    assert alone.batch(0).context.mask.numel() == 0
+    assert alone.batch(0).names() == ["policy"]

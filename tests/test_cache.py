@@ -13,12 +13,16 @@ import pytest
 from tcmrl_cli.data import data
 
 from tcmrl_data import (
-    BatchSizes,
+    BatchRequest,
     Dataset,
     Selection,
+    Trajectories,
+    Transitions,
+    Windows,
     clear_cache,
     list_cache,
     open_dataset,
+    open_sampler,
     parse_bytes,
 )
 from tcmrl_data.foundation.errors import CacheError, StoreError
@@ -28,7 +32,9 @@ from tcmrl_data.sampling.cache_entry import _write_rows
 from tcmrl_data.sampling.rows import Indices, PartRows, Table, read_rows
 from tests.commands import Call, in_process
 
-SIZES = BatchSizes(transitions=20, windows=5, window_length=3)
+REQUEST = BatchRequest(
+    tasks=16, kinds={"policy": Transitions(20), "context": Trajectories(1), "windows": Windows(5, length=3)}
+)
 
 
 @pytest.fixture(autouse=True)
@@ -58,10 +64,10 @@ def test_the_cache_holds_the_rows_that_memory_holds(selection: Selection) -> Non
 
 def test_batches_are_the_same_from_the_cache(selection: Selection) -> None:
     said: list[str] = []
-    left = selection.sampler(SIZES, seed=1).batch(7)
-    right = selection.sampler(SIZES, seed=1, memory_limit=1000, say=said.append).batch(7)
-    assert left.windows.observations.equal(right.windows.observations)
-    assert left.context.rewards.equal(right.context.rewards)
+    left = open_sampler(selection, REQUEST, seed=1).batch(7)
+    right = open_sampler(selection, REQUEST, seed=1, memory_limit=1000, say=said.append).batch(7)
+    assert left["windows"].observations.equal(right["windows"].observations)
+    assert left["context"].rewards.equal(right["context"].rewards)
     assert "exceed the memory limit" in said[0] and "happens once" in said[1]
 
 
@@ -111,12 +117,12 @@ def test_what_is_read_is_never_evicted(
     selection: Selection, tiny: Dataset, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("TCMRL_CACHE_LIMIT", "1k")
-    sampler = selection.sampler(SIZES, seed=0, memory_limit=1)
-    expected = selection.sampler(SIZES, seed=0).batch(3)
+    sampler = open_sampler(selection, REQUEST, seed=0, memory_limit=1)
+    expected = open_sampler(selection, REQUEST, seed=0).batch(3)
     cached_rows(tiny.select(split="train", snapshots="last"))
     assert [each.in_use for each in list_cache()] == [True, False]
     assert len(clear_cache()) == 1
-    assert sampler.batch(3).context.rewards.equal(expected.context.rewards)
+    assert sampler.batch(3)["context"].rewards.equal(expected["context"].rewards)
     del sampler
     assert [each.in_use for each in list_cache()] == [False]
     assert len(clear_cache()) == 1 and not entries(folder)

@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from tcmrl_data import BatchSizes, Prefetch
+from tcmrl_data import BatchRequest, Prefetch, Trajectories, Transitions
 from tests.sampling import numbered_tasks, sampler_of
 
 
@@ -25,12 +25,15 @@ def test_items_come_in_order_whatever_the_depth(depth: int) -> None:
 
 @pytest.mark.parametrize("depth", [0, 1, 3])
 def test_batches_are_the_same_whatever_the_depth(depth: int) -> None:
-    sampler = sampler_of(numbered_tasks([[5, 6, 7]] * 3), BatchSizes(transitions=8))
+    sampler = sampler_of(
+        numbered_tasks([[5, 6, 7]] * 3),
+        BatchRequest(tasks=16, kinds={"policy": Transitions(8), "context": Trajectories(1)}),
+    )
     with sampler.prefetch(4, 30, depth=depth) as batches:
         for n, batch in zip(range(4, 30), batches, strict=True):
             expected = sampler.batch(n)
-            assert batch.transitions.observations.equal(expected.transitions.observations)
-            assert batch.context.rewards.equal(expected.context.rewards)
+            assert batch["policy"].observations.equal(expected["policy"].observations)
+            assert batch["context"].rewards.equal(expected["context"].rewards)
 
 
 def test_no_more_are_made_than_the_depth_and_the_one_at_work() -> None:

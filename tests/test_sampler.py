@@ -6,20 +6,31 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tcmrl_data import Batch, BatchSizes, Dataset, Steps, Trajectory
-from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data import (
+    Batch,
+    BatchRequest,
+    Dataset,
+    Steps,
+    Trajectories,
+    Trajectory,
+    Transitions,
+    Windows,
+    open_sampler,
+)
+from tcmrl_data.foundation.errors import RequestError, SelectionError
 from tcmrl_data.sampling.draws import BLOCK, distinct
 from tcmrl_data.sampling.sampler import Sampler
 from tests.sampling import numbered_tasks, sampler_of
 from tests.strategies import trajectories
 
-SIZES = BatchSizes(
+REQUEST = BatchRequest(
     tasks=3,
-    transitions=50,
-    context_trajectories=(1, 2),
-    execution_trajectories=2,
-    windows=20,
-    window_length=4,
+    kinds={
+        "policy": Transitions(50),
+        "context": Trajectories((1, 2)),
+        "execution": Trajectories(2, apart_from="context"),
+        "windows": Windows(20, length=4),
+    },
 )
 
 
@@ -31,11 +42,11 @@ EQUAL = [[6, 6, 6, 6]] * 3
 
 @pytest.fixture
 def sampler() -> Sampler:
-    return sampler_of(numbered_tasks(LENGTHS), SIZES, seed=3)
+    return sampler_of(numbered_tasks(LENGTHS), REQUEST, seed=3)
 
 
 def leaves(batch: Batch) -> list[torch.Tensor]:
-    steps = [getattr(batch, field) for field in ("transitions", "context", "execution", "windows")]
+    steps = [batch[name] for name in batch.names()]
     return [batch.task_indices, *(getattr(s, f.name) for s in steps for f in dataclasses.fields(s))]
 
 
@@ -44,12 +55,12 @@ def test_a_batch_is_a_function_of_seed_and_number(sampler: Sampler) -> None:
     again = [sampler.batch(n) for n in (2, 7)]
     for left, right in zip(later, reversed(again), strict=True):
         assert all(torch.equal(a, b) for a, b in zip(leaves(left), leaves(right), strict=True))
-    assert not torch.equal(later[0].transitions.observations, later[1].transitions.observations)
+    assert not torch.equal(later[0]["policy"].observations, later[1]["policy"].observations)
 
 
 def test_transitions_are_what_was_stored(sampler: Sampler) -> None:
     for n in range(20):
-        steps = sampler.batch(n).transitions
+        steps = sampler.batch(n)["policy"]
         task, episode, t = steps.observations.unbind(-1)
         assert torch.equal(steps.rewards, 100 * task + 10 * episode + t)
         assert torch.equal(steps.next_observations, torch.stack([task, episode, t + 1], -1))
@@ -61,14 +72,14 @@ def test_transitions_are_what_was_stored(sampler: Sampler) -> None:
 def test_rows_of_a_batch_belong_to_its_tasks(sampler: Sampler) -> None:
     batch = sampler.batch(0)
     assert sorted(batch.task_indices.tolist()) == [0, 1, 2]
-    for steps in (batch.transitions, batch.context, batch.execution, batch.windows):
+    for steps in (batch["policy"], batch["context"], batch["execution"], batch["windows"]):
         tasks, mask = steps.observations[..., 0].flatten(1), steps.mask.flatten(1)
         assert torch.equal(tasks[mask], batch.task_indices[:, None].expand_as(tasks)[mask].float())
 
 
 def test_windows_never_cross_an_episode(sampler: Sampler) -> None:
     for n in range(50):
-        windows = sampler.batch(n).windows.observations
+        windows = sampler.batch(n)["windows"].observations
         assert windows.shape == (3, 20, 4, 3)
         assert (windows[..., :2] == windows[..., :1, :2]).all(), "a window holds two episodes"
         assert (windows[..., 1:, 2] - windows[..., :-1, 2] == 1).all(), "a window is not contiguous"
@@ -79,14 +90,14 @@ def test_windows_never_cross_an_episode(sampler: Sampler) -> None:
 def test_execution_is_never_the_context(sampler: Sampler) -> None:
     for n in range(50):
         batch = sampler.batch(n)
-        context = batch.context.observations[:, :, 0, 1]
-        execution = batch.execution.observations[:, :, 0, 1]
+        context = batch["context"].observations[:, :, 0, 1]
+        execution = batch["execution"].observations[:, :, 0, 1]
         assert not (context[:, :, None] == execution[:, None, :]).any()
         assert (execution[:, 0] != execution[:, 1]).all()
 
 
 def test_masks_mark_the_episode_and_nothing_else(sampler: Sampler) -> None:
-    context: Steps = sampler.batch(1).context
+    context: Steps = sampler.batch(1)["context"]
     task, episode, t = context.observations.unbind(-1)
     lengths = torch.tensor(LENGTHS)[task.long(), episode.long()]
     assert context.mask.shape[-1] == 10
@@ -104,16 +115,25 @@ def chi_square(counts: np.typing.NDArray[np.int64]) -> float:
 @pytest.mark.parametrize("lengths", [LENGTHS, EQUAL], ids=["ragged", "equal"])
 def test_a_million_draws_are_uniform(lengths: list[list[int]]) -> None:
     """Tasks over tasks; transitions, windows and trajectories over all valid ones of a task."""
-    sizes = BatchSizes(tasks=2, transitions=1000, execution_trajectories=1, windows=1000, window_length=4)
-    sampler = sampler_of(numbered_tasks(lengths), sizes)
+    request = BatchRequest(
+        tasks=2,
+        kinds={
+            "policy": Transitions(1000),
+            "context": Trajectories(1),
+            "execution": Trajectories(1, apart_from="context"),
+            "windows": Windows(1000, length=4),
+        },
+    )
+    sampler = sampler_of(numbered_tasks(lengths), request)
     rows = np.zeros((2, len(sampler._rows.table)), dtype=np.int64)
     tasks, episodes = np.zeros(3, dtype=np.int64), np.zeros(12, dtype=np.int64)
     for n in range(500):
         draw = sampler._draws(n)
-        for counts, drawn in zip(rows, (draw.transitions, draw.windows), strict=True):
+        for counts, drawn in zip(rows, (draw.picks["policy"], draw.picks["windows"]), strict=True):
             counts += np.bincount(drawn.ravel(), minlength=len(counts))
         tasks += np.bincount(draw.tasks, minlength=3)
-        episodes += np.bincount(draw.trajectories.ravel(), minlength=12)
+        for name in ("context", "execution"):
+            episodes += np.bincount(draw.picks[name].ravel(), minlength=12)
     assert rows.sum() == 2 * 10**6
     assert chi_square(tasks) < 4
     first = 0
@@ -136,11 +156,19 @@ def test_every_length_around_k_is_served_as_stated(lengths: list[list[int]], n: 
     """K = 4: episodes of 0, 1, K - 1, K and K + 1 steps."""
     for each in lengths:
         each += [1, 5]
-    sizes = BatchSizes(tasks=3, transitions=9, execution_trajectories=1, windows=7, window_length=4)
-    sampler = sampler_of(numbered_tasks(lengths), sizes)
-    assert sampler.short_trajectories == sum(0 < steps < 4 for each in lengths for steps in each)
+    request = BatchRequest(
+        tasks=3,
+        kinds={
+            "policy": Transitions(9),
+            "context": Trajectories(1),
+            "execution": Trajectories(1, apart_from="context"),
+            "windows": Windows(7, length=4),
+        },
+    )
+    sampler = sampler_of(numbered_tasks(lengths), request)
+    assert sampler.short_trajectories(4) == sum(0 < steps < 4 for each in lengths for steps in each)
     batch = sampler.batch(n)
-    for steps in (batch.transitions, batch.context, batch.execution, batch.windows):
+    for steps in (batch["policy"], batch["context"], batch["execution"], batch["windows"]):
         task, episode, t = (each[steps.mask] for each in steps.observations.unbind(-1))
         length = torch.tensor([lengths[int(b)][int(e)] for b, e in zip(task, episode, strict=True)])
         assert (t < length).all() and steps.mask.flatten(1).any(1).all()
@@ -149,11 +177,11 @@ def test_every_length_around_k_is_served_as_stated(lengths: list[list[int]], n: 
         assert torch.equal(steps.rewards[steps.mask], 100 * task + 10 * episode + t)
         assert torch.equal(steps.terminated[steps.mask].bool(), (t == length - 1) & (episode % 2 == 0))
         assert not steps.rewards[~steps.mask].any() and not steps.actions[~steps.mask].any()
-    assert batch.context.mask.sum(-1).min() > 0, "an episode without steps was drawn"
+    assert batch["context"].mask.sum(-1).min() > 0, "an episode without steps was drawn"
 
 
 def test_padding_holds_nothing_of_another_episode(sampler: Sampler) -> None:
-    context = sampler.batch(0).context
+    context = sampler.batch(0)["context"]
     beyond = ~context.mask
     assert not context.next_observations[beyond].any()
     first_padding = beyond & torch.cat([torch.ones_like(beyond[..., :1]), context.mask[..., :-1]], -1)
@@ -162,7 +190,7 @@ def test_padding_holds_nothing_of_another_episode(sampler: Sampler) -> None:
 
 def test_kept_batches_are_never_overwritten_and_dropped_ones_are_used_again(sampler: Sampler) -> None:
     kept = [sampler.batch(n) for n in range(40)]
-    view = sampler.batch(40).windows.rewards[1]  # a part of a batch counts as much
+    view = sampler.batch(40)["windows"].rewards[1]  # a part of a batch counts as much
     before = [[leaf.clone() for leaf in leaves(batch)] for batch in kept], view.clone()
     for n in range(41, 141):
         sampler.batch(n)
@@ -173,32 +201,32 @@ def test_kept_batches_are_never_overwritten_and_dropped_ones_are_used_again(samp
     )
     assert torch.equal(view, before[1])
     del kept, view
-    places = {sampler.batch(n).transitions.observations.data_ptr() for n in range(100)}
+    places = {sampler.batch(n)["policy"].observations.data_ptr() for n in range(100)}
     assert len(places) <= 2
 
 
 def test_tasks_depend_on_seed_and_number_alone(sampler: Sampler) -> None:
     """Two samplers of one seed over the same tasks may be read side by side."""
-    fewer = SIZES.model_copy(
-        update={"transitions": 1, "context_trajectories": (0,), "execution_trajectories": 0, "windows": 0}
-    )
+    fewer = BatchRequest(tasks=3, kinds={"policy": Transitions(1)})
     other = sampler_of(numbered_tasks([[9, 2]] * 3), fewer, seed=3)
     for n in (0, 1, 17, 40):
         batch = other.batch(n)
         assert torch.equal(batch.task_indices, sampler.batch(n).task_indices)
-        assert batch.context.observations.shape == batch.execution.observations.shape == (3, 0, 9, 3)
+        assert batch.names() == ["policy"] and "context" not in batch
+        with pytest.raises(RequestError, match=r"no kind 'context' in this batch, which holds \['policy'\]"):
+            batch["context"]
 
 
 def test_streams_of_one_seed_differ(sampler: Sampler) -> None:
-    first, second = (sampler_of(numbered_tasks(LENGTHS), SIZES, seed=3, stream=stream) for stream in (0, 1))
-    assert torch.equal(first.batch(5).windows.rewards, sampler.batch(5).windows.rewards)
-    assert not torch.equal(first.batch(5).windows.rewards, second.batch(5).windows.rewards)
+    first, second = (sampler_of(numbered_tasks(LENGTHS), REQUEST, seed=3, stream=stream) for stream in (0, 1))
+    assert torch.equal(first.batch(5)["windows"].rewards, sampler.batch(5)["windows"].rewards)
+    assert not torch.equal(first.batch(5)["windows"].rewards, second.batch(5)["windows"].rewards)
 
 
 @given(st.integers(0, 10 * BLOCK))
 @settings(deadline=None, max_examples=30)
 def test_resuming_at_n_gives_the_batches_of_an_uninterrupted_run(n: int) -> None:
-    straight, resumed = (sampler_of(numbered_tasks(LENGTHS), SIZES) for _ in range(2))
+    straight, resumed = (sampler_of(numbered_tasks(LENGTHS), REQUEST) for _ in range(2))
     for earlier in range(max(0, n - 3), n):
         straight.batch(earlier)
     for each in range(n, n + 2):
@@ -226,10 +254,9 @@ def test_distinct_draws_are_uniform() -> None:
 )
 @settings(deadline=None, max_examples=30)
 def test_moments_equal_those_of_the_flat_data(chunk_rows: int, episodes: list[list[Trajectory]]) -> None:
-    sizes = BatchSizes(transitions=4, window_length=2)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tcmrl_data.sampling.moments.CHUNK_ROWS", chunk_rows)
-        found = sampler_of(episodes, sizes).moments()
+        found = sampler_of(episodes, BatchRequest(tasks=2, kinds={})).moments()
     flat = [each for task in episodes for each in task]
     observations = np.concatenate([each.observations[:-1] for each in flat]).astype(np.float64)
     deltas = np.concatenate([np.diff(each.observations, axis=0) for each in flat]).astype(np.float64)
@@ -240,25 +267,26 @@ def test_moments_equal_those_of_the_flat_data(chunk_rows: int, episodes: list[li
 
 def test_test_tasks_are_refused_for_training(tiny: Dataset) -> None:
     with pytest.raises(SelectionError, match=r"test tasks \[3\]"):
-        tiny.select().sampler(BatchSizes(), seed=0)
+        open_sampler(tiny.select(), REQUEST, seed=0)
 
 
 def test_one_task_is_not_enough(tiny: Dataset) -> None:
     with pytest.raises(SelectionError, match="at least 2"):
-        tiny.select(tasks=[0]).sampler(BatchSizes(), seed=0)
+        open_sampler(tiny.select(tasks=[0]), REQUEST, seed=0)
 
 
 def test_too_few_trajectories_are_named(tiny: Dataset) -> None:
-    sizes = BatchSizes(context_trajectories=(30,))
-    with pytest.raises(SelectionError, match=r"task 0 has 18 selected trajectories, a batch takes 31"):
-        tiny.select(split="train").sampler(sizes, seed=0)
+    request = BatchRequest(
+        tasks=3, kinds={"context": Trajectories(30), "execution": Trajectories(1, apart_from="context")}
+    )
+    with pytest.raises(SelectionError, match=r"task 0 has 18 selected trajectories, a batch takes 30"):
+        open_sampler(tiny.select(split="train"), request, seed=0)
 
 
 def test_no_task_parameter_is_reachable_from_a_batch(sampler: Sampler) -> None:
     """The in-memory tasks have an index and nothing else: a sampler that asks for more fails here."""
-    assert {field.name for field in dataclasses.fields(Batch)} == {
-        "task_indices", "transitions", "context", "execution", "windows",
-    }  # fmt: skip
+    assert {field.name for field in dataclasses.fields(Batch)} == {"task_indices", "steps"}
+    assert set(sampler.batch(0).names()) == set(REQUEST.kinds)
     assert {field.name for field in dataclasses.fields(Steps)} == {
         "observations", "actions", "rewards", "next_observations", "terminated", "mask",
     }  # fmt: skip
@@ -272,7 +300,7 @@ def test_batches_on_a_device_equal_those_on_the_cpu(
 ) -> None:
     monkeypatch.setattr("tcmrl_data.sampling.gather.DEVICE_SHARE", share)
     selection = tiny.select(split="train")
-    left, right = (selection.sampler(SIZES, seed=1, device=name) for name in ("cpu", "cuda"))
+    left, right = (open_sampler(selection, REQUEST, seed=1, device=name) for name in ("cpu", "cuda"))
     with right.prefetch(0, 20) as batches:
         for n, batch in enumerate(batches):
             pairs = zip(leaves(left.batch(n)), leaves(batch), strict=True)

@@ -11,7 +11,7 @@ from tcmrl_algo.algorithms import tcmrl
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLosses
 from tcmrl_algo.losses.context import task_contrastive_loss
 from tcmrl_data import Batch, Steps
-from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps
+from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, with_steps
 
 SMALL: dict[str, Any] = {"latent": 4, "encoder_hidden": (8,), "tce_hidden": (8,), "estimator_hidden": (8,)}
 ONLY = dict.fromkeys(tcmrl.Weights.model_fields, 0.0)
@@ -120,7 +120,7 @@ def test_an_update_moves_everything_that_learns_w_included() -> None:
 def test_padding_changes_neither_losses_nor_contexts(sparse: bool) -> None:
     made = learner({"negative_noise": 0.0, "weights": {"orthogonality": 1.0}}, sparse=sparse)
     plain, padded = batch(), batch()
-    padded = replace(padded, context=scramble(padded.context), execution=scramble(padded.execution))
+    padded = with_steps(padded, context=scramble(padded["context"]), execution=scramble(padded["execution"]))
     first, second = losses_of(made, plain), losses_of(made, padded)
     torch.testing.assert_close(first.context, second.context)
     torch.testing.assert_close(first.total, second.total)
@@ -132,7 +132,7 @@ def test_padding_changes_neither_losses_nor_contexts(sparse: bool) -> None:
 def test_contexts_never_see_execution_trajectories() -> None:
     made = learner({"weights": ONLY | {"positive": 1.0}})
     plain = batch()
-    other = replace(plain, execution=steps(TASKS, 1, EPISODE, seed=33))
+    other = with_steps(plain, execution=steps(TASKS, 1, EPISODE, seed=33))
     first, second = losses_of(made, plain), losses_of(made, other)
     torch.testing.assert_close(first.context, second.context)
     assert first.total.item() != second.total.item()  # rewards are estimated on them
@@ -145,7 +145,7 @@ def test_order_of_tasks_changes_no_context_and_no_loss() -> None:
     def permuted(values: Steps) -> Steps:
         return Steps(*(getattr(values, name)[order] for name in values.__dataclass_fields__))
 
-    moved = replace(plain, context=permuted(plain.context), execution=permuted(plain.execution))
+    moved = with_steps(plain, context=permuted(plain["context"]), execution=permuted(plain["execution"]))
     first, second = losses_of(made, plain), losses_of(made, moved)
     torch.testing.assert_close(first.context[order], second.context)
     torch.testing.assert_close(first.total, second.total)
@@ -164,7 +164,7 @@ def test_sampled_windows_replace_those_of_the_context() -> None:
     made = learner()
     plain = losses_of(made).metrics["loss/contrastive"].item()
     drawn = [
-        losses_of(made, replace(batch(), windows=steps(TASKS, 4, 2, seed=seed))).metrics for seed in (7, 8)
+        losses_of(made, with_steps(batch(), windows=steps(TASKS, 4, 2, seed=seed))).metrics for seed in (7, 8)
     ]
     assert len({plain, *(each["loss/contrastive"].item() for each in drawn)}) == 3
     assert drawn[0]["loss/distance"].item() == drawn[1]["loss/distance"].item()
@@ -212,12 +212,12 @@ def test_k_is_the_length_of_the_windows(window_length: int) -> None:
     made = settings()
     sizes = made.batch.model_copy(update={"window_length": window_length})
     config = tcmrl.Config.model_validate(SMALL)
-    changed = tcmrl.TcmrlLearner(problem(), made.model_copy(update={"batch": sizes}), config)
-    (representations,) = changed.encoder(context := changed.encoder.read(batch().context))
+    other = tcmrl.TcmrlLearner(problem(), made.model_copy(update={"batch": sizes}), config)
+    (representations,) = other.encoder(context := other.encoder.read(batch()["context"]))
     expected = task_contrastive_loss(
-        representations, context.mask, changed.similarity, window_length=window_length
+        representations, context.mask, other.similarity, window_length=window_length
     )
-    found = losses_of(changed).metrics
+    found = losses_of(other).metrics
     torch.testing.assert_close(found["loss/contrastive"], expected)
     first = losses_of(learner()).metrics
     different = {name for name, each in first.items() if not torch.equal(each, found[name])}
@@ -238,7 +238,8 @@ def test_rewards_are_estimated_by_transition_or_by_trajectory(level: str, sparse
     made = learner({"reward_estimation": level, "weights": ONLY | {"positive": 1.0}}, sparse=sparse)
     assert made.estimates_trajectories is whole
     plain = batch(lengths=None)
-    moved = replace(plain, execution=replace(plain.execution, rewards=plain.execution.rewards.roll(1, 2)))
+    execution = plain["execution"]
+    moved = with_steps(plain, execution=replace(execution, rewards=execution.rewards.roll(1, 2)))
     first, second = losses_of(made, plain).total.item(), losses_of(made, moved).total.item()
     assert (first == pytest.approx(second, rel=1e-5)) is whole
 
@@ -246,7 +247,7 @@ def test_rewards_are_estimated_by_transition_or_by_trajectory(level: str, sparse
 def test_without_the_extractor_the_context_is_the_mean() -> None:
     made = learner({"extractor": "mean", "weights": {"orthogonality": 1.0}})
     found = losses_of(made)
-    (representations,) = made.encoder(context := made.encoder.read(batch().context))
+    (representations,) = made.encoder(context := made.encoder.read(batch()["context"]))
     for lane, values in enumerate(representations):
         torch.testing.assert_close(found.context[lane], values[context.mask[lane]].mean(dim=0))
     assert terms_of(found) == {"positive", "contrastive", "distance"}

@@ -17,13 +17,14 @@ import tcmrl_algo
 from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
 from tcmrl_algo.algorithms import tcmrl as tcmrl_module
 from tcmrl_algo.settings.actor_critic import ActorCriticSettings
+from tcmrl_algo.settings.batch import BatchSettings
 from tcmrl_algo.settings.brac import BracSettings
 from tcmrl_algo.settings.optimizer import OptimizerSettings
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_algo.training.config import ALGORITHMS
 from tcmrl_algo.training.train import Progress
-from tcmrl_data import BatchSizes, CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
+from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
 from tcmrl_data.foundation.plugins import modules
 from tests.commands import Call, assert_refused, in_process
 
@@ -384,7 +385,7 @@ def test_public_names_load() -> None:
     [
         RunSettings,
         OptimizerSettings,
-        BatchSizes,
+        BatchSettings,
         ActorCriticSettings,
         BracSettings,
         tcmrl_module.Config,

@@ -13,7 +13,7 @@ from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.problem import Algorithm, Problem
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, BatchSizes, Steps
+from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions
 
 NAME = "focal"
 
@@ -34,9 +34,17 @@ class Config(BaseModel):
     epsilon: float = Field(default=0.1, gt=0)
 
 
-def batch_sizes(settings: TrainingSettings) -> BatchSizes:
+def batch_request(settings: TrainingSettings, config: Config) -> BatchRequest:
     """The `[training.batch]` table without windows."""
-    return settings.batch.model_copy(update={"windows": 0})
+    batch = settings.batch
+    return BatchRequest(
+        tasks=batch.tasks,
+        kinds={
+            "policy": Transitions(batch.transitions),
+            "context": Trajectories(batch.context_trajectories),
+            "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
+        },
+    )
 
 
 def create(problem: Problem, settings: TrainingSettings, config: Config) -> Algorithm:
@@ -58,12 +66,12 @@ class FocalLearner(ContextLearner):
 
     def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
         """The distances of single trajectories' contexts, execution trajectories among them."""
-        groups = [self.encoder.read(batch.context), self.encoder.read(batch.execution)]
+        groups = [self.encoder.read(batch["context"]), self.encoder.read(batch["execution"])]
         representations = torch.cat(self.encoder(*groups), dim=1)
         mask = torch.cat([each.mask for each in groups], dim=1)
         single = mean_representation(representations.flatten(0, 1), mask.flatten(0, 1))
         distance = losses.distance_metric_loss(single.unflatten(0, mask.shape[:2]), epsilon=self._epsilon)
-        num_context = batch.context.mask.shape[1]
+        num_context = batch["context"].mask.shape[1]
         context = mean_representation(
             representations[:, :num_context].flatten(1, 2), mask[:, :num_context].flatten(1, 2)
         )

@@ -16,7 +16,7 @@ from torch import Tensor
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.methods.problem import Algorithm, Problem
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, BatchSizes, Steps
+from tcmrl_data import Batch, BatchRequest, Steps, Transitions
 
 NAME = "no_context"
 
@@ -27,10 +27,9 @@ class Config(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
 
-def batch_sizes(settings: TrainingSettings) -> BatchSizes:
-    """The `[training.batch]` table without the trajectories that nothing here reads."""
-    unused = {"context_trajectories": (0,), "execution_trajectories": 0, "windows": 0}
-    return settings.batch.model_copy(update=unused)
+def batch_request(settings: TrainingSettings, config: Config) -> BatchRequest:
+    """The actor-critic's transitions: nothing here reads a trajectory."""
+    return BatchRequest(settings.batch.tasks, {"policy": Transitions(settings.batch.transitions)})
 
 
 def create(problem: Problem, settings: TrainingSettings, config: Config) -> Algorithm:
@@ -45,7 +44,7 @@ class Blind(ContextLearner):
     latent = 0
 
     def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
-        rewards = batch.transitions.rewards
+        rewards = batch["policy"].rewards
         return ContextLosses(rewards.new_zeros(()), rewards.new_zeros(len(rewards), 0), {})
 
     def context(self, steps: Steps) -> Float[Tensor, "lanes latent"]:

@@ -15,7 +15,7 @@ from tcmrl_algo.networks.attention import Attention, TaskExtractor, uniform_atte
 from tcmrl_algo.networks.perceptron import call_frozen
 from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, BatchSizes, Steps
+from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions, Windows
 
 NAME = "tcmrl"
 
@@ -81,9 +81,18 @@ class Config(BaseModel):
     weights: Weights = Weights()
 
 
-def batch_sizes(settings: TrainingSettings) -> BatchSizes:
+def batch_request(settings: TrainingSettings, config: Config) -> BatchRequest:
     """The `[training.batch]` table as it is."""
-    return settings.batch
+    batch = settings.batch
+    return BatchRequest(
+        tasks=batch.tasks,
+        kinds={
+            "policy": Transitions(batch.transitions),
+            "context": Trajectories(batch.context_trajectories),
+            "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
+            "windows": Windows(batch.windows, batch.window_length),
+        },
+    )
 
 
 def create(problem: Problem, settings: TrainingSettings, config: Config) -> Algorithm:
@@ -130,8 +139,8 @@ class TcmrlLearner(ContextLearner):
         windows, the contrastive loss takes all windows of the context trajectories.
         """
         weights, encoder = self.config.weights, self.encoder
-        context, execution = encoder.read(batch.context), encoder.read(batch.execution)
-        windows = encoder.read(batch.windows) if batch.windows.mask.numel() else context
+        context, execution = encoder.read(batch["context"]), encoder.read(batch["execution"])
+        windows = encoder.read(batch["windows"]) if "windows" in batch else context
         groups = [context]
         groups += [execution] if weights.distance else []
         groups += [windows] if weights.contrastive and windows is not context else []

@@ -102,7 +102,7 @@ class ContextAlgorithm(Algorithm):
     def update(self, batch: Batch, step: int) -> Metrics:
         found = self.learner.losses(batch, step, self._problem.generator(step))
         generator = self._problem.generator(step, ACTOR_CRITIC_STREAM)
-        rows = self.actor_critic.rows(batch.transitions, found.context)
+        rows = self.actor_critic.rows(batch["policy"], found.context)
         self.actor_critic.train_dual(rows, generator)
         loss, metrics = self.actor_critic.losses(rows, generator)
         self._adam.step(found.total + loss, steps_done=step - 1)

@@ -127,7 +127,7 @@ class Algorithm(abc.ABC):
     """A meta-learner: trained on batches, then adapted to a task by that task's trajectories.
 
     A method is one file in `tcmrl_algo/algorithms` with NAME, a frozen `Config` (its own table of a
-    recipe's `[training]`), `batch_sizes(settings)`, what its batches must hold, and
+    recipe's `[training]`), `batch_request(settings, config)`, what its batches hold, and
     `create(problem, settings, config) -> Algorithm`. Training, checkpoints and
     evaluation know no more of it than this class.
     """

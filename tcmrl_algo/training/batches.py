@@ -1,13 +1,12 @@
 """The stream of batches that a run learns from; contexts may come from other snapshots than transitions."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Protocol, final, runtime_checkable
 
 import torch
 
-from tcmrl_algo.training.config import ALGORITHMS, TrainingConfig
-from tcmrl_data import Batch, BatchSizes, Dataset, Moments, Sampler, plugin
+from tcmrl_algo.settings.run import RunSettings
+from tcmrl_data import Batch, BatchRequest, Dataset, Moments, Sampler, Transitions, open_sampler
 
 
 @runtime_checkable
@@ -18,50 +17,66 @@ class Batches(Protocol):
         """The n-th batch, n >= 0."""
         ...
 
+    def with_request(self, request: BatchRequest) -> "Batches":
+        """The same stream for another request, of the same snapshots; nothing is loaded again."""
+        ...
+
     def moments(self) -> Moments:
         """Statistics over all transitions that the actor-critic may see."""
         ...
 
-    @property
-    def short_trajectories(self) -> int:
-        """How many trajectories are shorter than K, and so hold no window."""
+    def short_trajectories(self, length: int) -> int:
+        """How many trajectories hold no window of `length` steps."""
         ...
 
 
 def open_batches(
     dataset: Dataset,
-    config: TrainingConfig,
+    run: RunSettings,
+    request: BatchRequest,
     *,
     seed: int,
     device: torch.device,
     memory_limit: int | None,
     say: Callable[[str], None],
 ) -> Batches:
-    """The stream of batches from the training tasks; arguments as of `train_run`."""
-    run = config.settings.run
-    sizes: BatchSizes = plugin(ALGORITHMS, "algorithm", run.algorithm).batch_sizes(config.settings)
+    """The stream of batches from the training tasks.
 
-    def sampler(snapshots: str, sizes: BatchSizes) -> Sampler:
+    Args:
+        dataset: what to learn from.
+        run: `snapshots` and `context_snapshots` say which.
+        request: what a batch holds.
+        seed: of the run.
+        device: where batches are to be.
+        memory_limit: as for `train_run`.
+        say: as for `train_run`.
+    """
+
+    def sampler(snapshots: str, request: BatchRequest) -> Sampler:
         selection = dataset.select(split="train", snapshots=snapshots)
-        return selection.sampler(sizes, seed=seed, device=str(device), memory_limit=memory_limit, say=say)
+        return open_sampler(
+            selection, request, seed=seed, device=str(device), memory_limit=memory_limit, say=say
+        )
 
-    reads = max(sizes.context_trajectories) + sizes.execution_trajectories + sizes.windows
-    if run.context_snapshots is None or not reads:
-        return sampler(run.snapshots, sizes)
-    nothing = {"context_trajectories": (0,), "execution_trajectories": 0, "windows": 0}
-    return JoinedBatches(
-        sampler(run.snapshots, sizes.model_copy(update=nothing)),
-        sampler(run.context_snapshots, sizes),  # as many transitions, so that other draws follow them
-    )
+    transitions = only_transitions(request)
+    if run.context_snapshots is None or transitions == request:
+        return sampler(run.snapshots, request)
+    return JoinedBatches(sampler(run.snapshots, transitions), sampler(run.context_snapshots, request))
+
+
+def only_transitions(request: BatchRequest) -> BatchRequest:
+    """The request's kinds of transitions alone."""
+    kinds = {name: kind for name, kind in request.kinds.items() if isinstance(kind, Transitions)}
+    return BatchRequest(request.tasks, kinds)
 
 
 @final
 class JoinedBatches:
-    """Transitions from one sampler; context, execution trajectories and windows from another.
+    """Transitions from one sampler; trajectories and windows from another.
 
     Args:
-        transitions: where the actor-critic's transitions come from.
-        contexts: where everything else comes from; of the same seed and tasks.
+        transitions: where kinds of transitions come from.
+        contexts: where all other kinds come from; of the same seed and tasks.
     """
 
     def __init__(self, transitions: Sampler, contexts: Sampler) -> None:
@@ -72,13 +87,17 @@ class JoinedBatches:
         found = self._contexts.batch(n)
         transitions = self._transitions.batch(n)
         assert torch.equal(found.task_indices, transitions.task_indices)
-        return replace(found, transitions=transitions.transitions)
+        return Batch(found.task_indices, {**found.steps, **transitions.steps})
+
+    def with_request(self, request: BatchRequest) -> "JoinedBatches":
+        """Batches of another request from the same snapshots."""
+        transitions = self._transitions.with_request(only_transitions(request))
+        return JoinedBatches(transitions, self._contexts.with_request(request))
 
     def moments(self) -> Moments:
         """Statistics over the actor-critic's transitions."""
         return self._transitions.moments()
 
-    @property
-    def short_trajectories(self) -> int:
-        """How many of the contexts' trajectories are shorter than K."""
-        return self._contexts.short_trajectories
+    def short_trajectories(self, length: int) -> int:
+        """How many of the contexts' trajectories are shorter than `length`."""
+        return self._contexts.short_trajectories(length)

@@ -7,8 +7,10 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 
 import torch
+from pydantic import BaseModel
 from torch import Tensor
 
 from tcmrl_algo.methods.problem import Algorithm, MomentsRecord, problem_of
@@ -18,7 +20,7 @@ from tcmrl_algo.training.config import ALGORITHMS, TrainingConfig
 from tcmrl_algo.training.interruption import DeferredInterrupts
 from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_algo.training.metrics import MetricsWriter
-from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError, plugin
+from tcmrl_data import BatchRequest, CheckpointError, Dataset, Prefetch, TrainingError, plugin
 from tcmrl_data.foundation.validation import validate_table
 
 PACKAGES = ("torch", "numpy")
@@ -119,7 +121,13 @@ def train_run(
             f"{out} holds a run already; add --resume to go on with it, or name another --out"
         )
     batches = open_batches(
-        dataset, config, seed=seed, device=usable_device(device), memory_limit=memory_limit, say=say
+        dataset,
+        config.settings.run,
+        batch_request(config),
+        seed=seed,
+        device=usable_device(device),
+        memory_limit=memory_limit,
+        say=say,
     )
     record = RunRecord(
         environment=dataset.name,
@@ -174,7 +182,8 @@ def resume_run(
         raise CheckpointError(f"{out} is at step {start} already, beyond --steps {record.steps}")
     batches = open_batches(
         dataset,
-        record.config,
+        record.config.settings.run,
+        batch_request(record.config),
         seed=record.seed,
         device=usable_device(record.device),
         memory_limit=memory_limit,
@@ -185,6 +194,20 @@ def resume_run(
     if start:
         algorithm.load_tensors(run.newest().tensors())
     return _train(write_run(run.folder, record), algorithm, batches, start=start, report=report)
+
+
+def batch_request(config: TrainingConfig) -> BatchRequest:
+    """What a run's method reads of a batch."""
+    module = plugin(ALGORITHMS, "algorithm", config.settings.run.algorithm)
+    request: BatchRequest = module.batch_request(config.settings, _method_table(module, config))
+    return request
+
+
+def _method_table(module: ModuleType, config: TrainingConfig) -> BaseModel:
+    table: BaseModel = validate_table(
+        module.Config, config.method, place="run.json", error=TrainingError, table="config.method"
+    )
+    return table
 
 
 def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
@@ -203,10 +226,7 @@ def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
         device=usable_device(record.device),
     )
     module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
-    config = validate_table(
-        module.Config, record.config.method, place="run.json", error=TrainingError, table="config.method"
-    )
-    algorithm: Algorithm = module.create(problem, settings, config)
+    algorithm: Algorithm = module.create(problem, settings, _method_table(module, record.config))
     return algorithm
 
 
@@ -235,6 +255,7 @@ def _train(
 ) -> TrainingReport:
     """The loop: batch n - 1 makes step n; Ctrl-C and SIGTERM take effect after a checkpoint of their step."""
     settings, last = run.record.config.settings.run, run.record.steps
+    window_length = run.record.config.settings.batch.window_length
     keep_freed_memory()
     began = time.perf_counter()
     logged_at, logged_step, logged_wait = began, start, 0.0
@@ -252,7 +273,7 @@ def _train(
                 seconds = max(now - logged_at, 1e-9)
                 rate, share = (step - logged_step) / seconds, (stream.waited - logged_wait) / seconds
                 logged_at, logged_step, logged_wait = now, step, stream.waited
-                about = {"data/short_trajectories": float(batches.short_trajectories)}
+                about = {"data/short_trajectories": float(batches.short_trajectories(window_length))}
                 times = {"time/steps_per_second": rate, "time/data_share": share}
                 writer.write(step, values | about | times)
                 report(Progress(step, last, rate, share, values))

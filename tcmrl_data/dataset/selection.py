@@ -1,7 +1,6 @@
 """Some tasks and snapshots of a dataset: what exports, samplers and evaluations read."""
 
 import re
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,7 +12,6 @@ from tcmrl_data.foundation.errors import SelectionError
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.dataset import Dataset
-    from tcmrl_data.sampling.sampler import BatchSizes, Sampler
 
 
 def chosen_steps(dataset: "Dataset", task: int, rule: str) -> tuple[int, ...]:
@@ -66,47 +64,3 @@ class Selection:
     def trajectories(self, task: int) -> list[Trajectory]:
         """All selected episodes of a task, snapshot by snapshot."""
         return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
-
-    def sampler(
-        self,
-        sizes: "BatchSizes",
-        *,
-        seed: int,
-        stream: int = 0,
-        device: str = "cpu",
-        memory_limit: int | None = None,
-        say: Callable[[str], None] = lambda message: None,
-    ) -> "Sampler":
-        """Loads the selection once and serves meta-training batches from it.
-
-        Args:
-            sizes: what a batch holds.
-            seed: of the run; batch n is a function of (seed, stream, n).
-            stream: further streams of batches under the same seed.
-            device: where batches are to be.
-            memory_limit: bytes that the decoded steps may take in memory, half of what is available if left
-                out; larger selections are decoded into the cache once and read from there.
-            say: told when the cache is used.
-
-        Raises:
-            SelectionError: the selection holds test tasks, fewer than two tasks, or too little of one.
-        """
-        from tcmrl_data.sampling.cache import load_rows
-        from tcmrl_data.sampling.sampler import Sampler
-
-        test = [task.index for task in self.tasks if task.split == "test"]
-        if test:
-            raise SelectionError(f"test tasks {test} must not be trained on; select split='train'")
-        if len(self.tasks) < 2:
-            raise SelectionError(
-                f"meta-training needs at least 2 training tasks, the selection has {len(self.tasks)}"
-            )
-        return Sampler(
-            load_rows(self, memory_limit=memory_limit, say=say),
-            sizes,
-            seed=seed,
-            stream=stream,
-            environment=self.dataset.name,
-            place=str(self.dataset.folder),
-            device=device,
-        )

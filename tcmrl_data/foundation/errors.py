@@ -41,6 +41,10 @@ class SelectionError(TcmrlError):
     """A selection of tasks, snapshots or trajectories that is empty or not allowed."""
 
 
+class RequestError(TcmrlError):
+    """A batch request whose numbers or names do not hold together."""
+
+
 class BuildError(TcmrlError):
     """A build that cannot start, or units that failed."""
 

@@ -1,33 +1,13 @@
-"""What meta-training is served: sizes of a batch, the batch itself, statistics of the data."""
+"""What meta-training is served: batches, and statistics of the data."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor
 
-
-class BatchSizes(BaseModel):
-    """What one batch holds.
-
-    Attributes:
-        tasks: tasks per batch, drawn without replacement (capped at the selected tasks).
-        transitions: transitions per task for the actor-critic.
-        context_trajectories: context trajectories per task; one of these numbers is drawn per batch.
-        execution_trajectories: execution trajectories per task, never among the context ones.
-        windows: K-step windows per task, uniform over all valid windows; 0 for none.
-        window_length: K.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    tasks: int = Field(default=16, ge=2)
-    transitions: int = Field(default=256, ge=1)
-    context_trajectories: tuple[int, ...] = Field(default=(1,), min_length=1)
-    execution_trajectories: int = Field(default=1, ge=0)
-    windows: int = Field(default=0, ge=0)
-    window_length: int = Field(default=2, ge=2)
+from tcmrl_data.foundation.errors import RequestError
 
 
 @dataclass(frozen=True)
@@ -62,17 +42,35 @@ class Batch:
 
     Attributes:
         task_indices: (tasks,) int64, distinct.
-        transitions: leading shape (tasks, transitions).
-        context: leading shape (tasks, context trajectories, longest episode), padded at the end.
-        execution: leading shape (tasks, execution trajectories, longest episode), padded at the end.
-        windows: leading shape (tasks, windows, K), each inside one episode.
+        steps: the requested kinds by name. Leading shapes are (tasks, number) of transitions, (tasks, number,
+            length) of windows, each inside one episode, and (tasks, number, longest episode) of
+            trajectories, padded at the end.
+
+    Example:
+        >>> batch = sampler.batch(0)  # doctest: +SKIP
+        >>> batch["context"].rewards.shape  # doctest: +SKIP
+        torch.Size([16, 2, 200])
     """
 
     task_indices: Tensor
-    transitions: Steps
-    context: Steps
-    execution: Steps
-    windows: Steps
+    steps: Mapping[str, Steps]
+
+    def __getitem__(self, name: str) -> Steps:
+        """The steps of one kind.
+
+        Raises:
+            RequestError: the batch's request has no such kind, or a number of 0 for it.
+        """
+        if name not in self.steps:
+            raise RequestError(f"no kind {name!r} in this batch, which holds {self.names()}; request it")
+        return self.steps[name]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.steps
+
+    def names(self) -> list[str]:
+        """The kinds in the order of the request."""
+        return list(self.steps)
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from tcmrl_data.sampling.cache_entry import (
     try_lock,
     write_entry,
 )
-from tcmrl_data.sampling.rows import Rows, plan_rows, read_rows, table_shape
+from tcmrl_data.sampling.rows import PackedRows, plan_rows, read_rows, table_shape
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.selection import Selection
@@ -75,7 +75,7 @@ def load_rows(
     *,
     memory_limit: int | None = None,
     say: Callable[[str], None] = lambda message: None,
-) -> Rows:
+) -> PackedRows:
     """The rows of a selection: in memory where they fit, else from the cache.
 
     Args:
@@ -96,7 +96,7 @@ def load_rows(
     return cached_rows(selection, say=say)
 
 
-def cached_rows(selection: "Selection", *, say: Callable[[str], None] = lambda message: None) -> Rows:
+def cached_rows(selection: "Selection", *, say: Callable[[str], None] = lambda message: None) -> PackedRows:
     """The rows of a selection from the cache, decoded into it first where they are not there.
 
     The entry stays locked against eviction as long as its table is in use.

@@ -31,8 +31,8 @@ from tcmrl_data.foundation.disk import (
 from tcmrl_data.sampling.rows import (
     Episodes,
     Indices,
+    PackedRows,
     PartRows,
-    Rows,
     Table,
     each_part,
     plan_rows,
@@ -81,7 +81,7 @@ class EntryRecord(BaseModel):
         return 4 * self.shape[0] * self.shape[1]
 
 
-def open_entry(entry: Path, selection: "Selection") -> Rows | None:
+def open_entry(entry: Path, selection: "Selection") -> PackedRows | None:
     """The rows of an entry, locked as long as its table lives; None where there is no whole entry."""
     try:
         file = (entry / RECORD).open("rb")

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.sampling.batch import BatchSizes
+from tcmrl_data.sampling.request import BatchRequest, Trajectories, Windows
 from tcmrl_data.sampling.rows import Episodes, Indices
 
 Uniform = npt.NDArray[np.float64]
@@ -20,17 +20,11 @@ class Draw(NamedTuple):
 
     Attributes:
         tasks: (tasks,) positions of the tasks.
-        transitions: (tasks, transitions) rows.
-        windows: (tasks, windows) first rows.
-        trajectories: (tasks, context + execution) episodes, the context ones first.
-        num_context: how many are context.
+        picks: (tasks, number) by kind: rows of transitions, first rows of windows, episodes.
     """
 
     tasks: Indices
-    transitions: Indices
-    windows: Indices
-    trajectories: Indices
-    num_context: int
+    picks: dict[str, Indices]
 
 
 @dataclass(frozen=True)
@@ -85,23 +79,25 @@ class Draws:
 
     Args:
         episodes: what there is.
-        sizes: what a batch takes; at most as many tasks as there are.
+        request: what a batch takes; at most as many tasks as there are.
         key: (2,) uint64 of the counter-based generator (Philox; Salmon et al., 2011).
     """
 
     def __init__(
-        self, episodes: Episodes, sizes: BatchSizes, *, key: npt.NDArray[np.unsignedinteger[Any]]
+        self, episodes: Episodes, request: BatchRequest, *, key: npt.NDArray[np.unsignedinteger[Any]]
     ) -> None:
-        self._sizes, self._key, self._episode_ranges = sizes, key, episodes.task_ranges
-        self._transitions = Starts.of(episodes, 1)
-        self._windows = Starts.of(episodes, sizes.window_length)
-        self.num_tasks = min(sizes.tasks, len(episodes.task_ranges))
+        self._key, self._episode_ranges = key, episodes.task_ranges
+        kinds = request.kinds.items()
+        self._trajectories = {name: kind for name, kind in kinds if isinstance(kind, Trajectories)}
+        stretches = [(name, kind) for name, kind in kinds if not isinstance(kind, Trajectories)]
+        stretches.sort(key=lambda item: isinstance(item[1], Windows))
+        self._starts = {name: (kind.number, Starts.of(episodes, kind.length)) for name, kind in stretches}
+        self.num_tasks = min(request.tasks, len(episodes.task_ranges))
         self._block: tuple[int, list[Draw]] = (-1, [])
 
-    @property
-    def num_windows(self) -> Indices:
-        """(tasks,) valid windows of each task."""
-        result: Indices = np.diff(self._windows.task_ranges)[:, 0]
+    def num_starts(self, name: str) -> Indices:
+        """(tasks,) valid transitions or windows of each task."""
+        result: Indices = np.diff(self._starts[name][1].task_ranges)[:, 0]
         return result
 
     def __call__(self, n: int) -> Draw:
@@ -114,27 +110,23 @@ class Draws:
 
     def _make(self, number: int) -> list[Draw]:
         """The batches number * BLOCK, …, from uniform numbers in [0, 1) of 53 bits."""
-        sizes, all_tasks = self._sizes, len(self._episode_ranges)
         random = np.random.Generator(np.random.Philox(key=self._key, counter=[0, 0, 0, number]))
-        order = random.random((BLOCK, all_tasks)).argsort(axis=1)
+        order = random.random((BLOCK, len(self._episode_ranges))).argsort(axis=1)
         tasks: Indices = order[:, : self.num_tasks].astype(np.int64)
-        choices = np.array(sizes.context_trajectories)
-        context = choices[_below(random.random(BLOCK), len(choices))]
+        chosen = random.random(BLOCK)
         shape = (BLOCK, self.num_tasks)
-        transitions = self._transitions.draw(tasks, random.random((*shape, sizes.transitions)))
-        windows = self._windows.draw(tasks, random.random((*shape, sizes.windows)))
-        most = int(choices.max()) + sizes.execution_trajectories
-        trajectories = distinct(self._episode_ranges[tasks], random.random((*shape, most)))
-        return [
-            Draw(
-                tasks[i],
-                transitions[i],
-                windows[i],
-                trajectories[i, :, : count + sizes.execution_trajectories],
-                count,
-            )
-            for i, count in enumerate(context.tolist())
-        ]
+        picks = {
+            name: list(starts.draw(tasks, random.random((*shape, count))))
+            for name, (count, starts) in self._starts.items()
+        }
+        most = sum(kind.number for kind in self._trajectories.values())
+        episodes = distinct(self._episode_ranges[tasks], random.random((*shape, most)))
+        first = np.zeros(BLOCK, dtype=np.int64)
+        for name, kind in self._trajectories.items():
+            last = first + np.array(kind.numbers)[_below(chosen, len(kind.numbers))]
+            picks[name] = [episodes[i, :, first[i] : last[i]] for i in range(BLOCK)]
+            first = last
+        return [Draw(tasks[i], {name: found[i] for name, found in picks.items()}) for i in range(BLOCK)]
 
 
 def distinct(ranges: Indices, uniform: Uniform) -> Indices:

@@ -2,15 +2,16 @@
 
 import weakref
 from collections import deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from tcmrl_data.sampling.batch import Batch, BatchSizes, Steps
+from tcmrl_data.sampling.batch import Batch, Steps
 from tcmrl_data.sampling.draws import Draw
-from tcmrl_data.sampling.rows import Rows, Table
+from tcmrl_data.sampling.request import BatchRequest, Kind, Trajectories, Transitions
+from tcmrl_data.sampling.rows import Indices, PackedRows, Table
 
 SPARE_BUFFERS = 8
 """Buffers kept for later batches; more exist while more batches are held."""
@@ -26,82 +27,104 @@ _Fields = tuple[list[_Field], Tensor]
 """The fields of steps in their order, and the mask."""
 
 
+@dataclass(frozen=True)
+class _Block:
+    """Where a kind lies in a buffer, whatever its number in a batch.
+
+    Attributes:
+        kind: what is gathered.
+        view: the table's stretches of the kind's length, by their first row.
+        offset: floats before it.
+    """
+
+    kind: Kind
+    view: Tensor
+    offset: int
+
+
 class Gatherer:
     """Fetches a drawn batch.
 
     K steps and the observation behind them are one stretch of the table, so a view whose rows overlap
     (row i: the block that starts at row i) gives a transition, a window or a trajectory by one index.
+
+    Args:
+        rows: the packed selection.
+        table: their table, in the memory of this machine or on the device.
+        request: what a batch holds.
+        num_tasks: tasks per batch.
+        device: where batches are to be.
     """
 
-    def __init__(self, rows: Rows, sizes: BatchSizes, *, num_tasks: int, device: torch.device) -> None:
-        self._rows, self._device = rows, device
-        self._width, self._longest = rows.table.shape[1], rows.episodes.longest
+    def __init__(
+        self, rows: PackedRows, table: Tensor, request: BatchRequest, *, num_tasks: int, device: torch.device
+    ) -> None:
+        self._rows, self._device, self._num_tasks = rows, device, num_tasks
+        self._width: int = rows.table.shape[1]
+        self._longest = rows.episodes.longest
         self._is_ragged = bool((rows.episodes.lengths != self._longest).any())
-        step = self._width + rows.observation_dim
-        window = sizes.window_length * self._width + rows.observation_dim
-        trajectory = (self._longest + 1) * self._width
-        table = torch.from_numpy(rows.table)
-        if device.type == "cuda" and table.nbytes <= DEVICE_SHARE * torch.cuda.mem_get_info(device)[0]:
-            table = table.to(device)
-        self._views = [_overlapping(table, floats) for floats in (step, window, trajectory)]
-        most = max(sizes.context_trajectories) + sizes.execution_trajectories
-        each_task = sizes.transitions * step + sizes.windows * window + most * trajectory
+        self._blocks: dict[str, _Block] = {}
+        end = 0
+        for name, kind in request.kinds.items():
+            view = _overlapping(table, self._floats(kind))
+            self._blocks[name] = _Block(kind, view, end)
+            end += num_tasks * kind.number * view.shape[1]
         self._buffers: _HostBuffers | _PinnedBuffers | _DeviceBuffers
         if device.type == "cuda":
-            kind = _DeviceBuffers if table.is_cuda else _PinnedBuffers
-            self._buffers = kind(num_tasks * each_task, device)
+            self._buffers = (_DeviceBuffers if table.is_cuda else _PinnedBuffers)(end, device)
         else:
-            self._buffers = _HostBuffers(num_tasks * each_task, device)
-        self._layouts: dict[int, list[_Fields | Steps]] = {}
-        self._window_length = sizes.window_length
+            self._buffers = _HostBuffers(end, device)
+        self._layouts: dict[tuple[str, int], _Fields | Steps] = {}
+
+    def _floats(self, kind: Kind) -> int:
+        """Floats of one transition, window or trajectory with the observation behind it."""
+        if isinstance(kind, Trajectories):
+            return (self._longest + 1) * self._width
+        return kind.length * self._width + self._rows.observation_dim
 
     def __call__(self, draw: Draw) -> Batch:
         """The batch of a draw, on the device."""
-        starts = self._rows.episodes.starts[draw.trajectories]
         memory = self._buffers.take()
-        ends, end = [0], 0
-        for view, rows in zip(self._views, (draw.transitions, draw.windows, starts), strict=True):
-            if rows.size:
-                end += rows.size * view.shape[1]
-                block = memory[ends[-1] : end].view(rows.size, view.shape[1])
-                index = torch.from_numpy(rows.reshape(-1)).to(memory.device)
-                torch.index_select(view, 0, index, out=block)
-            ends.append(end)
-        mask = self._trajectory_mask(draw, memory[ends[2] : end]) if self._is_ragged else None
+        masks = {name: self._gather(memory, block, draw.picks[name]) for name, block in self._blocks.items()}
         memory = self._buffers.hand_out(memory)
-        transitions, windows, context, execution = (
-            each if isinstance(each, Steps) else self._steps(memory, *each)
-            for each in self._layout(draw, ends)
-        )
-        if mask is not None:
-            context = replace(context, mask=mask[:, : draw.num_context])
-            execution = replace(execution, mask=mask[:, draw.num_context :])
-        tasks = torch.from_numpy(self._rows.task_indices[draw.tasks])
-        return Batch(tasks, transitions, context, execution, windows)
+        steps = {}
+        for name, mask in masks.items():
+            layout = self._layout(name, draw.picks[name].shape[1])
+            found = layout if isinstance(layout, Steps) else _steps(memory, *layout)
+            steps[name] = found if mask is None else replace(found, mask=mask)
+        return Batch(torch.from_numpy(self._rows.task_indices[draw.tasks]), steps)
 
-    @staticmethod
-    def _steps(memory: Tensor, fields: list[_Field], mask: Tensor) -> Steps:
-        observations, actions, rewards, following, terminated = (
-            memory.as_strided(*field) for field in fields
-        )
-        return Steps(observations, actions, rewards, following, terminated, mask)
+    def _gather(self, memory: Tensor, block: _Block, picks: Indices) -> Tensor | None:
+        """Copies a kind into the buffer; returns its mask where some of it is padding."""
+        is_trajectory = isinstance(block.kind, Trajectories)
+        rows = self._rows.episodes.starts[picks] if is_trajectory else picks
+        floats = block.view.shape[1]
+        out = memory[block.offset : block.offset + rows.size * floats].view(rows.size, floats)
+        if rows.size:
+            index = torch.from_numpy(rows.reshape(-1)).to(memory.device)
+            torch.index_select(block.view, 0, index, out=out)
+        return self._clear_padding(out, picks) if is_trajectory and self._is_ragged else None
 
-    def _layout(self, draw: Draw, ends: list[int]) -> list[_Fields | Steps]:
-        """Where transitions, windows, context and execution lie, or what they are where they are empty."""
-        if draw.num_context not in self._layouts:
-            step, window, trajectory = (view.shape[1] for view in self._views)
-            count, longest, width = draw.trajectories.shape[1], self._longest, self._width
-            split = ends[2] + draw.num_context * trajectory
-            windows = (draw.windows.shape[1] * window, window, width)
-            trajectories = (count * trajectory, trajectory, width)
-            tasks = len(draw.tasks)
-            self._layouts[draw.num_context] = [
-                self._fields(draw.transitions.shape, (draw.transitions.shape[1] * step, step), ends[0]),
-                self._fields((*draw.windows.shape, self._window_length), windows, ends[1]),
-                self._fields((tasks, draw.num_context, longest), trajectories, ends[2]),
-                self._fields((tasks, count - draw.num_context, longest), trajectories, split),
-            ]
-        return self._layouts[draw.num_context]
+    def _clear_padding(self, out: Tensor, episodes: Indices) -> Tensor:
+        """(tasks, number, longest episode) mask; clears what was gathered beyond an episode."""
+        lengths = torch.from_numpy(self._rows.episodes.lengths[episodes]).to(out.device)[..., None]
+        t = torch.arange(self._longest + 1, device=out.device)
+        rows = out.view(*episodes.shape, self._longest + 1, self._width)
+        rows.masked_fill_((t > lengths)[..., None], 0.0)
+        return (t[:-1] < lengths).to(self._device)
+
+    def _layout(self, name: str, number: int) -> _Fields | Steps:
+        """Where a kind's fields lie, or what they are where it is empty."""
+        if (name, number) not in self._layouts:
+            block = self._blocks[name]
+            floats = block.view.shape[1]
+            shape: tuple[int, ...] = (self._num_tasks, number)
+            strides: tuple[int, ...] = (number * floats, floats)
+            if not isinstance(block.kind, Transitions):
+                length = self._longest if isinstance(block.kind, Trajectories) else block.kind.length
+                shape, strides = (*shape, length), (*strides, self._width)
+            self._layouts[name, number] = self._fields(shape, strides, block.offset)
+        return self._layouts[name, number]
 
     def _fields(self, shape: tuple[int, ...], strides: tuple[int, ...], offset: int) -> _Fields | Steps:
         """Where the fields of steps lie whose rows lie in a buffer from an offset on, and a full mask."""
@@ -118,17 +141,21 @@ class Gatherer:
         mask = torch.ones(shape, dtype=torch.bool, device=self._device)
         if 0 in shape:
             empty = torch.empty(0, device=self._device)
-            return self._steps(empty, [(size, stride, 0) for size, stride, _ in fields], mask)
+            return _steps(empty, [(size, stride, 0) for size, stride, _ in fields], mask)
         return fields, mask
 
-    def _trajectory_mask(self, draw: Draw, block: Tensor) -> Tensor:
-        """(tasks, trajectories, longest episode); clears in the gathered block what follows an episode."""
-        shape = draw.trajectories.shape
-        lengths = torch.from_numpy(self._rows.episodes.lengths[draw.trajectories]).to(block.device)[..., None]
-        t = torch.arange(self._longest + 1, device=block.device)
-        rows = block.view(*shape, self._longest + 1, self._width)
-        rows.masked_fill_((t > lengths)[..., None], 0.0)
-        return (t[:-1] < lengths).to(self._device)
+
+def _steps(memory: Tensor, fields: list[_Field], mask: Tensor) -> Steps:
+    observations, actions, rewards, following, terminated = (memory.as_strided(*field) for field in fields)
+    return Steps(observations, actions, rewards, following, terminated, mask)
+
+
+def place_table(table: Table, device: torch.device) -> Tensor:
+    """The table on the device where it takes at most half of the free memory there, else where it is."""
+    found = torch.from_numpy(table)
+    if device.type == "cuda" and found.nbytes <= DEVICE_SHARE * torch.cuda.mem_get_info(device)[0]:
+        return found.to(device)
+    return found
 
 
 def _overlapping(table: Tensor, floats: int) -> Tensor:

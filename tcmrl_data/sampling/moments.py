@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.sampling.batch import Moments
-from tcmrl_data.sampling.rows import Episodes, Rows
+from tcmrl_data.sampling.rows import Episodes, PackedRows
 
 CHUNK_ROWS = 2**16
 SMALLEST_STD = 1e-6
@@ -12,7 +12,7 @@ SMALLEST_STD = 1e-6
 Values = npt.NDArray[np.float64]
 
 
-def moments_of(rows: Rows) -> Moments:
+def moments_of(rows: PackedRows) -> Moments:
     """Statistics over all transitions of the rows, in double precision."""
     table, episodes = rows.table, rows.episodes
     stop = int(episodes.starts[-1] + episodes.lengths[-1])

@@ -60,7 +60,7 @@ class Episodes:
 
 
 @dataclass(frozen=True)
-class Rows:
+class PackedRows:
     """All steps of a selection, a row per observation: (observation, action, reward, terminated).
 
     An episode of T steps takes T + 1 rows, so the next observation is the next row; the last row of an
@@ -133,7 +133,7 @@ def table_shape(selection: "Selection", plan: Sequence[PartRows]) -> tuple[int, 
     return plan[-1].last + padding, environment.observation_dim + environment.action_dim + 2
 
 
-def read_rows(selection: "Selection") -> Rows:
+def read_rows(selection: "Selection") -> PackedRows:
     """Reads a selection into memory.
 
     Raises:
@@ -145,11 +145,11 @@ def read_rows(selection: "Selection") -> Rows:
     return selection_rows(selection, table, Episodes.of(lengths, [part.task for part in plan]))
 
 
-def selection_rows(selection: "Selection", table: Table, episodes: Episodes) -> Rows:
+def selection_rows(selection: "Selection", table: Table, episodes: Episodes) -> PackedRows:
     """The rows of a selection, given the filled table."""
     environment = selection.dataset.environment
     indices = np.array([task.index for task in selection.tasks], dtype=np.int64)
-    return Rows(table, episodes, environment.observation_dim, environment.action_dim, indices)
+    return PackedRows(table, episodes, environment.observation_dim, environment.action_dim, indices)
 
 
 def each_part(plan: Sequence[PartRows], read: Callable[[PartRows], Any]) -> Iterator[Any]:

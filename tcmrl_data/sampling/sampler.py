@@ -1,39 +1,92 @@
 """Meta-training batches: draws, then one gather per kind."""
 
+import copy
+from collections.abc import Callable
+from typing import Self
+
 import numpy as np
 import numpy.typing as npt
 import torch
 
+from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_sequence
-from tcmrl_data.sampling.batch import Batch, BatchSizes, Moments, Steps
+from tcmrl_data.sampling.batch import Batch, Moments
+from tcmrl_data.sampling.cache import load_rows
 from tcmrl_data.sampling.draws import Draws
-from tcmrl_data.sampling.gather import Gatherer
+from tcmrl_data.sampling.gather import Gatherer, place_table
 from tcmrl_data.sampling.moments import moments_of
 from tcmrl_data.sampling.prefetch import Prefetch
-from tcmrl_data.sampling.rows import Rows
+from tcmrl_data.sampling.request import BatchRequest, Trajectories
+from tcmrl_data.sampling.rows import Indices, PackedRows
 
-__all__ = ["Batch", "BatchSizes", "Moments", "Sampler", "Steps"]
+
+def open_sampler(
+    selection: Selection,
+    request: BatchRequest,
+    *,
+    seed: int,
+    stream: int = 0,
+    device: str = "cpu",
+    memory_limit: int | None = None,
+    say: Callable[[str], None] = lambda message: None,
+) -> "Sampler":
+    """Loads a selection once and serves meta-training batches from it.
+
+    Args:
+        selection: training tasks and snapshots.
+        request: what a batch holds.
+        seed: of the run; batch n is a function of (seed, stream, n).
+        stream: further streams of batches under the same seed.
+        device: where batches are to be.
+        memory_limit: bytes that the decoded steps may take in memory, half of what is available if left
+            out; larger selections are decoded into the cache once and read from there.
+        say: told when the cache is used.
+
+    Raises:
+        SelectionError: the selection holds test tasks, fewer than two tasks, or too little of one.
+
+    Example:
+        >>> request = BatchRequest(tasks=16, kinds={"context": Trajectories(2)})
+        >>> sampler = open_sampler(dataset.select(split="train"), request, seed=0)  # doctest: +SKIP
+        >>> sampler.batch(0)["context"].rewards.shape  # doctest: +SKIP
+        torch.Size([16, 2, 200])
+    """
+    test = [task.index for task in selection.tasks if task.split == "test"]
+    if test:
+        raise SelectionError(f"test tasks {test} must not be trained on; select split='train'")
+    if len(selection.tasks) < 2:
+        raise SelectionError(
+            f"meta-training needs at least 2 training tasks, the selection has {len(selection.tasks)}"
+        )
+    return Sampler(
+        load_rows(selection, memory_limit=memory_limit, say=say),
+        request,
+        seed=seed,
+        stream=stream,
+        environment=selection.dataset.name,
+        place=str(selection.dataset.folder),
+        device=device,
+    )
 
 
 class Sampler:
-    """Serves batch n as a pure function of (seed, stream, n); made by `Selection.sampler`.
+    """Serves batch n as a pure function of (seed, stream, n); made by `open_sampler`.
 
     Within a batch, tasks are drawn without replacement; within a task, transitions and windows uniformly
-    over all valid ones (with replacement), trajectories uniformly without replacement, so that context
-    and execution trajectories differ. Episodes without a step are never drawn, trajectories shorter than
-    K hold no window. Task parameters are never loaded.
+    over all valid ones (with replacement), trajectories uniformly without replacement. Episodes without
+    a step are never drawn, episodes shorter than a window hold none. Task parameters are never loaded.
 
     On a CUDA device the rows live there if they take at most half of its free memory; otherwise batches
     are gathered in page-locked memory and copied without blocking.
 
     Attributes:
-        sizes: what a batch holds.
+        request: what a batch holds.
         device: where batches are.
 
     Args:
         rows: the packed selection.
-        sizes: what a batch holds.
+        request: what a batch holds.
         seed: of the run.
         stream: further streams of the same seed, independent of each other.
         environment: its name, part of the seed's key.
@@ -41,13 +94,13 @@ class Sampler:
         device: a torch device.
 
     Raises:
-        SelectionError: a task has too few trajectories, or no window where windows are asked for.
+        SelectionError: a task has too few steps, trajectories or windows for the request.
     """
 
     def __init__(
         self,
-        rows: Rows,
-        sizes: BatchSizes,
+        rows: PackedRows,
+        request: BatchRequest,
         *,
         seed: int,
         stream: int = 0,
@@ -55,38 +108,61 @@ class Sampler:
         place: str,
         device: str = "cpu",
     ) -> None:
-        self.sizes, self.device = sizes, torch.device(device)
-        self._rows = rows
+        self.device = torch.device(device)
+        self._rows, self._place = rows, place
+        self._table = place_table(rows.table, self.device)
         sequence = keyed_sequence(seed, environment, NO_TASK, Purpose.SAMPLER, stream)
-        self._draws = Draws(rows.episodes, sizes, key=sequence.generate_state(2, np.uint64))
-        self._check(place)
-        self.num_tasks = self._draws.num_tasks
-        self._gather = Gatherer(rows, sizes, num_tasks=self.num_tasks, device=self.device)
+        self._key = sequence.generate_state(2, np.uint64)
+        self._serve(request)
+
+    def _serve(self, request: BatchRequest) -> None:
+        self.request = request
+        self._draws = Draws(self._rows.episodes, request, key=self._key)
+        self._check()
+        num_tasks = self._draws.num_tasks
+        self._gather = Gatherer(self._rows, self._table, request, num_tasks=num_tasks, device=self.device)
+
+    def with_request(self, request: BatchRequest) -> Self:
+        """A sampler of the same steps, seed and stream for another request; nothing is loaded again.
+
+        Raises:
+            SelectionError: a task has too few steps, trajectories or windows for the request.
+        """
+        other = copy.copy(self)
+        other._serve(request)
+        return other
 
     @property
     def task_indices(self) -> npt.NDArray[np.int64]:
         """(tasks,) indices of the tasks that batches are drawn from."""
         return self._rows.task_indices
 
-    @property
-    def short_trajectories(self) -> int:
-        """How many trajectories are shorter than K, and so hold no window."""
-        return int((self._rows.episodes.lengths < self.sizes.window_length).sum())
+    def short_trajectories(self, length: int) -> int:
+        """How many trajectories have fewer steps than `length`, and so hold no window of that length."""
+        return int((self._rows.episodes.lengths < length).sum())
 
-    def _check(self, place: str) -> None:
-        needed = max(self.sizes.context_trajectories) + self.sizes.execution_trajectories
-        counts = np.diff(self._rows.episodes.task_ranges)[:, 0]
-        for task, count, windows in zip(self.task_indices, counts, self._draws.num_windows, strict=True):
-            if count < needed:
-                raise SelectionError(
-                    f"{place}: task {task} has {count} selected trajectories, a batch takes {needed}"
-                )
-            if self.sizes.windows and not windows:
-                length = self.sizes.window_length
-                raise SelectionError(f"{place}: task {task} has no trajectory of {length} steps for a window")
+    def _check(self) -> None:
+        kinds = self.request.kinds
+        for name, kind in kinds.items():
+            if isinstance(kind, Trajectories):
+                partner = kinds.get(kind.apart_from or "")
+                needed = kind.number + (partner.number if partner else 0)
+                self._need(np.diff(self._rows.episodes.task_ranges)[:, 0], needed, "trajectories")
+            else:
+                self._need(self._draws.num_starts(name), 1, f"stretches of {kind.length} steps")
+
+    def _need(self, counts: Indices, needed: int, what: str) -> None:
+        if (counts >= needed).all():
+            return
+        position = int((counts < needed).argmax())
+        task, count = self.task_indices[position], counts[position]
+        raise SelectionError(
+            f"{self._place}: task {task} has {count} selected {what}, a batch takes {needed}; "
+            "select more snapshots, or request less"
+        )
 
     def batch(self, n: int) -> Batch:
-        """The n-th batch, n >= 0; the same for the same selection, sizes, seed and stream."""
+        """The n-th batch, n >= 0; the same for the same selection, request, seed and stream."""
         return self._gather(self._draws(n))
 
     def prefetch(self, first: int, last: int, *, depth: int = 2) -> Prefetch[Batch]:

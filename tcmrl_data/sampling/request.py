@@ -1,0 +1,126 @@
+"""What a batch must hold: kinds of data by name."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, TypeAlias
+
+from tcmrl_data.foundation.errors import RequestError
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """Single transitions, uniform over all of a task, with replacement.
+
+    Attributes:
+        number: transitions per task.
+    """
+
+    length: ClassVar[int] = 1
+    number: int
+
+
+@dataclass(frozen=True, init=False)
+class Trajectories:
+    """Whole episodes, uniform over all of a task, without replacement.
+
+    Attributes:
+        numbers: episodes per task; one of these numbers is drawn for every batch.
+        apart_from: the kind of trajectories with which this one shares no episode of a batch.
+
+    Args:
+        numbers: several numbers, or the only one.
+        apart_from: as above.
+    """
+
+    numbers: tuple[int, ...]
+    apart_from: str | None = None
+
+    def __init__(self, numbers: int | tuple[int, ...], *, apart_from: str | None = None) -> None:
+        object.__setattr__(self, "numbers", (numbers,) if isinstance(numbers, int) else tuple(numbers))
+        object.__setattr__(self, "apart_from", apart_from)
+
+    @property
+    def number(self) -> int:
+        """The most episodes per task that a batch may hold."""
+        return max(self.numbers, default=0)
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Stretches of consecutive transitions inside one episode, uniform over all of a task, with replacement.
+
+    Attributes:
+        number: windows per task.
+        length: transitions per window.
+    """
+
+    number: int
+    length: int
+
+
+Kind: TypeAlias = Transitions | Trajectories | Windows
+
+
+@dataclass(frozen=True)
+class BatchRequest:
+    """What every batch of a sampler holds.
+
+    Attributes:
+        tasks: tasks per batch, drawn without replacement; all selected tasks where there are fewer.
+        kinds: what is drawn of every task, by a name of the method's choice. A kind of number 0 is left out.
+
+    Raises:
+        RequestError: a number that is negative or missing, a length below 1, or an `apart_from` that names
+            no other kind of trajectories, one that is itself apart from another, or one that is taken.
+
+    Example:
+        >>> request = BatchRequest(
+        ...     tasks=4,
+        ...     kinds={
+        ...         "policy": Transitions(256),
+        ...         "context": Trajectories((1, 2)),
+        ...         "execution": Trajectories(1, apart_from="context"),
+        ...         "windows": Windows(0, length=8),
+        ...     },
+        ... )
+        >>> list(request.kinds)
+        ['policy', 'context', 'execution']
+    """
+
+    tasks: int
+    kinds: Mapping[str, Kind]
+
+    def __post_init__(self) -> None:
+        if self.tasks < 1:
+            raise RequestError(f"a batch holds at least 1 task, the request says {self.tasks}")
+        for name, kind in self.kinds.items():
+            _check_numbers(name, kind)
+        _check_partners(self.kinds)
+        kinds = {name: kind for name, kind in self.kinds.items() if kind.number}
+        object.__setattr__(self, "kinds", kinds)
+
+
+def _check_numbers(name: str, kind: Kind) -> None:
+    numbers = kind.numbers if isinstance(kind, Trajectories) else (kind.number,)
+    if not numbers or min(numbers) < 0:
+        raise RequestError(
+            f"{name!r}: numbers must be 0 or more and at least one, the request says {numbers}"
+        )
+    if isinstance(kind, Windows) and kind.length < 1:
+        raise RequestError(f"{name!r}: a window has at least 1 step, the request says {kind.length}")
+
+
+def _check_partners(kinds: Mapping[str, Kind]) -> None:
+    """Two kinds share the episodes of a task from both ends, so that a third finds no end."""
+    pairs = {
+        name: kind.apart_from
+        for name, kind in kinds.items()
+        if isinstance(kind, Trajectories) and kind.apart_from is not None
+    }
+    for name, partner in pairs.items():
+        if partner == name or not isinstance(kinds.get(partner), Trajectories):
+            raise RequestError(f"{name!r}: apart_from={partner!r} names no other kind of trajectories")
+        if partner in pairs or list(pairs.values()).count(partner) > 1:
+            raise RequestError(
+                f"{name!r}: apart_from={partner!r} would join more than two kinds; leave one of them free"
+            )
