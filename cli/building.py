@@ -130,7 +130,7 @@ def plan(
 )
 @click.option(
     "--seed",
-    type=click.IntRange(min=0),
+    type=click.IntRange(min=0, max=2**63 - 1),
     default=0,
     show_default=True,
     help="Seeds behavior training and rollouts; tasks and split do not depend on it.",

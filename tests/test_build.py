@@ -3,15 +3,35 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
+from typing import final
 
+import numpy as np
 import pytest
 
 import tcmrl_data
-from tcmrl_data import Dataset, Recipe, load_recipe, open_dataset
+from tcmrl_data import (
+    Dataset,
+    Purpose,
+    Recipe,
+    UniformController,
+    keyed_generator,
+    keyed_seed,
+    load_recipe,
+    open_dataset,
+    roll_out,
+)
+from tcmrl_data.build.driver import Driver
+from tcmrl_data.build.events import EventLog
+from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
+from tcmrl_data.envs.base import LaneStep
+from tcmrl_data.envs.point_robot import PointRobotLanes
+from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 from tcmrl_data.foundation.disk import LOCK, lock_file
 from tcmrl_data.foundation.errors import BuildError, LockedError, ManifestError, StoreError
+from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tests.conftest import TASKS, TINY
 
@@ -141,3 +161,73 @@ def test_the_manifest_is_its_canonical_form(tiny_folder: Path) -> None:
         "parameters": {"goal": [0.9954719225730846, 0.09505604330418267], "wind": [0.0, 0.0]},
     }
     assert values["references"]["3"]["oracle"] > values["references"]["3"]["uniform"]
+
+
+def test_a_foreign_file_does_not_stop_a_build_and_is_verifys_to_name(
+    tiny_copy: Copy, tiny_recipe: Recipe
+) -> None:
+    folder = tiny_copy()
+    (folder / "README.md").write_text("mine")
+    report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+    assert (report.built, report.present) == (0, 15)
+    (finding,) = tcmrl_data.verify_dataset(folder).findings
+    assert (finding.file, finding.foreign) == ("README.md", True)
+
+
+def test_a_seed_beyond_int64_is_refused(tiny_recipe: Recipe, tmp_path: Path) -> None:
+    with pytest.raises(BuildError, match=r"seed 18446744073709551616 is not in \[0, 2\*\*63\)"):
+        tcmrl_data.build_dataset(tiny_recipe, tmp_path / "out", seed=2**64, tasks=[0])
+    assert not (tmp_path / "out").exists()
+
+
+@final
+class HastyEngine(BaseEngine):
+    """Says that every unit is done and does nothing."""
+
+    name = "hasty"
+
+    def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
+        yield from (Result(unit.id, True, "0" * 64, None, 1, "here") for unit in units)
+
+
+def test_a_unit_that_is_done_without_its_parts_failed(tiny_recipe: Recipe, tmp_path: Path) -> None:
+    driver = Driver(tiny_recipe, tmp_path, 0, choose_tasks(tiny_recipe, [3]))
+    with EventLog(tmp_path, lambda event: None) as log:
+        (failure,) = driver.run(HastyEngine(), log)
+    assert "task 3 failed" in failure
+    assert "ended without 3 of its parts, the first is tasks/00003/snapshots/step_0000000" in failure
+    assert not read_manifest(tmp_path).complete
+
+
+def test_a_reward_that_is_not_finite_is_named(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = PointRobotLanes.step
+
+    def step_with_nan(self: PointRobotLanes, actions: FloatArray, active: BoolArray) -> LaneStep:
+        done = step(self, actions, active)
+        done.rewards[1] = np.nan
+        return done
+
+    monkeypatch.setattr(PointRobotLanes, "step", step_with_nan)
+    spec = UnitSpec(tmp_path, tiny_recipe, 0, tuple(choose_tasks(tiny_recipe, [3])))
+    with pytest.raises(BuildError, match="task 3, snapshot step 0, episode 1: rewards are not finite"):
+        run_unit(spec, lambda message: None)
+
+
+def test_references_are_means_of_the_recipes_number_of_episodes(tiny: Dataset, tiny_recipe: Recipe) -> None:
+    environment, key = tiny.environment, (0, "point-robot", 40)
+    returns = []
+    for first in (0, 3):
+        episodes = range(first, first + 3)
+        lanes = environment.lanes([tiny.task(40).parameters] * 3)
+        returns += roll_out(
+            environment,
+            lanes,
+            UniformController(),
+            reset_seeds=[keyed_seed(*key, Purpose.REFERENCE_RESET, episode) for episode in episodes],
+            noise=[keyed_generator(*key, Purpose.REFERENCE_NOISE, episode) for episode in episodes],
+        )
+    assert len(returns) == tiny_recipe.rollouts.episodes
+    mean = np.mean([trajectory.undiscounted_return for trajectory in returns])
+    assert tiny.references(40).uniform == pytest.approx(mean)

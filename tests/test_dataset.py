@@ -1,4 +1,5 @@
 import json
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 
@@ -157,3 +158,15 @@ def test_datasets_are_listed(tiny_folder: Path, tiny_copy: Copy) -> None:
     row = next(row for row in list_datasets(tiny_folder.parent) if row["path"] == str(tiny_folder))
     assert (row["name"], row["tasks"], row["parts"], row["complete"]) == ("point-robot", 5, 15, True)
     assert "schema_version" in list_datasets(broken.parent)[0]["error"]
+
+
+def test_a_task_that_is_named_twice_counts_once(tiny: Dataset) -> None:
+    assert [task.index for task in tiny.select(tasks=[40, 0, 40]).tasks] == [40, 0]
+
+
+def test_parts_that_a_repair_makes_again_are_not_listed(tiny_copy: Copy) -> None:
+    folder = tiny_copy()
+    shutil.copytree(folder, folder.parent / "staged")
+    (folder / ".staging").mkdir(exist_ok=True)
+    (folder.parent / "staged").rename(folder / ".staging" / "repair")
+    assert [row["path"] for row in list_datasets(folder.parent)] == [str(folder)]

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from tcmrl_data import build_status
-from tcmrl_data.build.events import EVENTS, BuildEvent, EventLog
+from tcmrl_data.build.events import EVENTS, TAIL_BYTES, BuildEvent, EventLog
 from tcmrl_data.foundation.disk import LOCK, lock_file
 from tests.conftest import TINY
 
@@ -79,3 +79,15 @@ def test_status_of_a_running_build_from_another_process(tmp_path: Path) -> None:
         assert document["parts_total"] == 6
         assert builder.wait() == 0
     assert build_status(out).complete
+
+
+def test_failures_are_remembered_however_long_the_build_goes_on(tiny_copy: Copy) -> None:
+    folder = tiny_copy()
+    with EventLog(folder, lambda _: None) as log:
+        log.write(event("start"))
+        log.write(event("unit_failed", "task 7", 100, "task 7 failed: why"))
+    line = (folder / EVENTS).read_text().splitlines()[-1]
+    later = json.dumps(json.loads(line) | {"kind": "steps", "unit": "task 8", "message": "task 8"})
+    with (folder / EVENTS).open("a") as file:
+        file.write(f"{later}\n" * (2 * TAIL_BYTES // len(later)))
+    assert build_status(folder).failed == ("task 7 failed: why",)

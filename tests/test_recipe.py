@@ -104,3 +104,9 @@ def test_only_data_settings_are_unit_settings() -> None:
         load_recipe("point-robot", overrides=["rollouts.episodes=100"]).unit_settings()
         != base.unit_settings()
     )
+
+
+@pytest.mark.parametrize("value", ["0.0", "-0.1", "inf"])
+def test_an_entropy_coefficient_that_is_not_above_0_is_refused(value: str) -> None:
+    with pytest.raises(RecipeError, match="entropy"):
+        load_recipe("point-robot", overrides=["behavior.source=sac", f"behavior.sac.entropy={value}"])

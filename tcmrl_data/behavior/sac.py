@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, Literal, SupportsFloat, final
+from typing import TYPE_CHECKING, Annotated, Any, Literal, SupportsFloat, final
 
 import gymnasium
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -32,6 +32,7 @@ class SacSettings(BaseModel):
             since they would all be the same untrained policy, and `steps` last.
         train_frequency: environment steps between updates.
         gradient_steps: gradient steps per update.
+        entropy: the entropy coefficient, above 0; `auto` learns it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -47,7 +48,7 @@ class SacSettings(BaseModel):
     buffer_size: int = Field(ge=1)
     train_frequency: int = Field(default=1, ge=1)
     gradient_steps: int = Field(default=1, ge=1)
-    entropy: Literal["auto"] | float = "auto"
+    entropy: Literal["auto"] | Annotated[float, Field(gt=0, allow_inf_nan=False)] = "auto"
 
     @model_validator(mode="after")
     def _snapshots_fit(self) -> "SacSettings":

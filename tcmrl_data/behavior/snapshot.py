@@ -186,12 +186,13 @@ def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
         observation: the view that the policy was trained with.
 
     Raises:
-        SnapshotError: no SAC with ReLU layers in the file, or the folder exists.
+        SnapshotError: no SAC with ReLU layers and actions in [-1, 1] in the file, or the folder exists.
         StorageError: the disk refuses.
     """
     import pickle
     import zipfile
 
+    from gymnasium.spaces import Box
     from stable_baselines3 import SAC
     from torch.nn import ReLU
 
@@ -202,6 +203,13 @@ def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
         layers = list(model.policy.actor.latent_pi)
         if not all(isinstance(layer, ReLU) for layer in layers[1::2]):
             raise SnapshotError(f"{file}: only policies with ReLU layers can be imported")
+        space = model.action_space
+        assert isinstance(space, Box)  # SAC takes no other
+        if (space.low != -1.0).any() or (space.high != 1.0).any():
+            raise SnapshotError(
+                f"{file}: its actions lie in [{space.low.min():g}, {space.high.max():g}], those of a stored "
+                "policy in [-1, 1]; train it on gymnasium.wrappers.RescaleAction(environment, -1, 1)"
+            )
         snapshot = snapshot_of_sac(model, step=model.num_timesteps, observation=observation)
     except (
         OSError,

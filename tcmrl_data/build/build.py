@@ -20,6 +20,9 @@ from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import DATA_VERSION, MANIFEST, read_manifest
 
+SEEDS = 2**63
+"""Seeds are stored as int64, in exports too."""
+
 OWN_FILES = {MANIFEST, LOCK, STAGING, CHECKPOINTS, EVENTS, "zarr.json", "tasks"}
 
 
@@ -68,13 +71,15 @@ def build_dataset(
         progress: called as the build goes on.
 
     Raises:
-        BuildError: `out` is no dataset, or one of other settings or another seed.
+        BuildError: a seed outside [0, 2**63), `out` is no dataset, or one of other settings or another seed.
         LockedError: another process builds this dataset.
         StoreError: a published part is damaged.
         ReadOnlyError: the folder cannot be written, and something is missing.
         StorageError: too little free space, or the disk refused; what was published stands.
     """
     started = time.monotonic()
+    if not 0 <= seed < SEEDS:
+        raise BuildError(f"seed {seed} is not in [0, 2**63); choose a smaller --seed")
     runner = ENGINES.get(engine)(workers, address=address)
     chosen = choose_tasks(recipe, tasks)
     _check_folder(out, recipe, seed)
@@ -106,10 +111,11 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
     """Refuses a folder that is neither new nor a dataset of this recipe and seed."""
     if not out.exists():
         return
-    if not out.is_dir() or {entry.name for entry in out.iterdir()} - OWN_FILES:
+    is_dataset = (out / MANIFEST).is_file()  # files of others beside the data are `verify`'s to name
+    if not out.is_dir() or (not is_dataset and {entry.name for entry in out.iterdir()} - OWN_FILES):
         raise BuildError(f"--out {out} exists and is no dataset; choose another folder")
     check_work_files(out)
-    if not (out / MANIFEST).is_file():
+    if not is_dataset:
         return
     manifest = read_manifest(out)
     if manifest.data_version != DATA_VERSION:

@@ -1,6 +1,7 @@
 """The one writer of a dataset's manifest: runs units and takes in what they publish."""
 
 import contextlib
+import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -82,6 +83,9 @@ class Driver:
                 for result in results:
                     for task in tasks_of[result.id]:
                         self._take_in_published(task.index)
+                    missing_parts = self._missing_parts(tasks_of[result.id]) if result.ok else ()
+                    if missing_parts:
+                        result = dataclasses.replace(result, ok=False, error=_without(missing_parts))
                     if result.ok:
                         log.write(self._event("unit_done", f"{result.id} done", result.id))
                     else:
@@ -113,6 +117,11 @@ class Driver:
 
     def _is_done(self, index: int) -> bool:
         return all((index, step) in self.parts for step in self._source.steps)
+
+    def _missing_parts(self, tasks: Sequence[Task]) -> list[str]:
+        """Folders of the tasks' parts that are not published."""
+        keys = ((task.index, step) for task in tasks for step in self._source.steps)
+        return [part_folder(*key) for key in keys if key not in self.parts]
 
     def _on_message(self, unit: str, message: Mapping[str, Any], log: EventLog) -> None:
         if message["kind"] == "steps":
@@ -218,6 +227,10 @@ def check_part(folder: Path) -> PartRecord:
 def _unit_id(tasks: Sequence[Task]) -> str:
     first, last = tasks[0].index, tasks[-1].index
     return f"task {first}" if len(tasks) == 1 else f"{len(tasks)} tasks from {first} to {last}"
+
+
+def _without(places: Sequence[str]) -> str:
+    return f"it ended without {len(places)} of its parts, the first is {places[0]}"
 
 
 def _failure(result: Result) -> str:

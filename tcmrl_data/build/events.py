@@ -4,7 +4,7 @@ import dataclasses
 import json
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -17,7 +17,13 @@ STEPS_SECONDS = 1.0
 """Progress within a unit is recorded at most this often."""
 
 TAIL_BYTES = 2**20
-"""A reader looks at the end of the record only."""
+"""A reader takes every event of the record's end, and before it only how builds began and units ended."""
+
+RECORD_BYTES = 2**30
+"""A reader looks at no more than this; a day of building writes about 30 MB."""
+
+LINE_BYTES = 2**16
+MILESTONES = tuple(f'"kind": "{kind}"'.encode() for kind in ("start", "unit_done", "unit_failed"))
 
 EventKind = Literal["start", "steps", "part", "unit_done", "unit_failed", "end"]
 
@@ -131,21 +137,30 @@ def build_status(dataset: Path) -> BuildStatus:
 
 def _latest_build(path: Path) -> list[dict[str, Any]]:
     """Events since the last `start`; lines that are no events are passed over."""
-    if not path.is_file() or path.is_symlink():
-        return []
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - TAIL_BYTES))
-        lines = file.read(TAIL_BYTES).split(b"\n")
     fields = {field.name for field in dataclasses.fields(BuildEvent)} | {"time", "process"}
     events: list[dict[str, Any]] = []
-    for line in lines:
+    for line in _lines(path):
         try:
             event = json.loads(line)
         except (ValueError, RecursionError):
             continue
         if isinstance(event, dict) and set(event) == fields and _is_well_typed(event):
-            events = [event] if event["kind"] == "start" else [*events, event]
+            if event["kind"] == "start":
+                events.clear()
+            events.append(event)
     return events
+
+
+def _lines(path: Path) -> Iterator[bytes]:
+    """The last lines of the record, and before them those that tell of milestones."""
+    if not path.is_file() or path.is_symlink():
+        return
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        file.seek(max(0, size - RECORD_BYTES))
+        while line := file.readline(LINE_BYTES):
+            if file.tell() > size - TAIL_BYTES or any(mark in line for mark in MILESTONES):
+                yield line
 
 
 def _is_well_typed(event: dict[str, Any]) -> bool:

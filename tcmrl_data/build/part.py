@@ -16,7 +16,7 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
 from tcmrl_data.foundation.disk import publish_folder
-from tcmrl_data.foundation.errors import NondeterminismError
+from tcmrl_data.foundation.errors import BuildError, NondeterminismError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
@@ -103,6 +103,8 @@ class PartMaker:
         trajectories = roll_out_part(
             self._recipe, self._seed, environment=environment, task=task, snapshot=snapshot, lanes=self._lanes
         )
+        place = f"{environment.name}, task {task.index}, snapshot step {snapshot.step}"
+        _check_finite(trajectories, place)
         if self._references is None:
             self._references = self._measure_references()
         return seal_part(
@@ -116,18 +118,24 @@ class PartMaker:
         )
 
     def _measure_references(self) -> References:
-        """Uniform, oracle and noise-free scripted returns of the task, from one lane batch each."""
+        """Uniform, oracle and noise-free scripted returns of the task, from the recipe's episodes each."""
         environment, lanes = self._environment, self._lanes
         assert lanes is not None
         key = (self._seed, environment.name, self.task.index)
-        seeds = [keyed_seed(*key, Purpose.REFERENCE_RESET, lane) for lane in range(lanes.num_lanes)]
 
         def mean_return(controller: Controller | None) -> float | None:
             if controller is None:
                 return None
-            noise = [keyed_generator(*key, Purpose.REFERENCE_NOISE, lane) for lane in range(lanes.num_lanes)]
-            episodes = roll_out(environment, lanes, controller, reset_seeds=seeds, noise=noise)
-            return float(np.mean([each.undiscounted_return for each in episodes]))
+            trajectories = _roll_out_batches(
+                environment,
+                lanes,
+                controller,
+                num_episodes=self._recipe.rollouts.episodes,
+                reset_key=(*key, Purpose.REFERENCE_RESET),
+                noise_key=(*key, Purpose.REFERENCE_NOISE),
+            )
+            _check_finite(trajectories, f"{environment.name}, task {self.task.index}, reference rollouts")
+            return float(np.mean([trajectory.undiscounted_return for trajectory in trajectories]))
 
         uniform = mean_return(UniformController())
         assert uniform is not None
@@ -191,14 +199,54 @@ def roll_out_part(
     """The recipe's episodes of one snapshot, in lane batches; each episode has its own keyed seeds."""
     controller = snapshot.controller(environment, [task.parameters] * lanes.num_lanes)
     key = (seed, environment.name, task.index)
+    return _roll_out_batches(
+        environment,
+        lanes,
+        controller,
+        num_episodes=recipe.rollouts.episodes,
+        reset_key=(*key, Purpose.ROLLOUT_RESET, snapshot.step),
+        noise_key=(*key, Purpose.ROLLOUT_NOISE, snapshot.step),
+    )
+
+
+StreamKey = tuple[int, str, int, Purpose, *tuple[int, ...]]
+"""Arguments of `keyed_sequence` but for the episode."""
+
+
+def _roll_out_batches(
+    environment: Environment,
+    lanes: Lanes,
+    controller: Controller,
+    *,
+    num_episodes: int,
+    reset_key: StreamKey,
+    noise_key: StreamKey,
+) -> list[Trajectory]:
     trajectories: list[Trajectory] = []
-    for first in range(0, recipe.rollouts.episodes, lanes.num_lanes):
+    for first in range(0, num_episodes, lanes.num_lanes):
         episodes = range(first, first + lanes.num_lanes)
         trajectories += roll_out(
             environment,
             lanes,
             controller,
-            reset_seeds=[keyed_seed(*key, Purpose.ROLLOUT_RESET, snapshot.step, each) for each in episodes],
-            noise=[keyed_generator(*key, Purpose.ROLLOUT_NOISE, snapshot.step, each) for each in episodes],
+            reset_seeds=[keyed_seed(*reset_key, episode) for episode in episodes],
+            noise=[keyed_generator(*noise_key, episode) for episode in episodes],
         )
     return trajectories
+
+
+def _check_finite(trajectories: Sequence[Trajectory], place: str) -> None:
+    """Refuses episodes with values that are not finite.
+
+    Raises:
+        BuildError: names the episode, the array and the step.
+    """
+    for episode, trajectory in enumerate(trajectories):
+        for name in ("rewards", "observations", "actions"):
+            array = getattr(trajectory, name)
+            rows = np.flatnonzero(~np.isfinite(array.reshape(len(array), -1)).all(axis=1))
+            if len(rows):
+                raise BuildError(
+                    f"{place}, episode {episode}: {name} are not finite at step {rows[0]} "
+                    f"({array[rows[0]]}); mend the environment"
+                )

@@ -16,6 +16,7 @@ from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.tasks import Task
+from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
@@ -66,7 +67,7 @@ def plan_build(recipe: Recipe, *, tasks: Sequence[int] | None = None, workers: i
     """
     chosen = choose_tasks(recipe, tasks)
     environment, source = recipe.make_environment(), behavior_source(recipe)
-    workers = workers or os.cpu_count() or 1
+    workers = workers or available_cores()
     episodes, horizon = recipe.rollouts.episodes, environment.settings.horizon
     parts = len(chosen) * len(source.steps)
     groups = group_tasks(chosen, source.group_size)

@@ -189,7 +189,7 @@ class Dataset:
 
         Args:
             split: only tasks of this split.
-            tasks: only these indices.
+            tasks: only these indices; one that is named twice counts once.
             snapshots: `all`, `last`, `steps>=N`, or `return>=Q`: of each task, the parts whose mean
                 return reaches the quantile Q in [0, 1] of the task's parts.
 
@@ -197,7 +197,9 @@ class Dataset:
             SelectionError: the rule cannot be read, or nothing is left of a task.
             TaskError: an index that the dataset does not hold.
         """
-        chosen = [self.task(index) for index in tasks] if tasks is not None else list(self.tasks)
+        chosen = list(self.tasks)
+        if tasks is not None:
+            chosen = [self.task(index) for index in dict.fromkeys(tasks)]
         chosen = [task for task in chosen if split is None or task.split == split]
         if not chosen:
             raise SelectionError(

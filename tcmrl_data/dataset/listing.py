@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Any
 
+from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
 
@@ -11,6 +12,8 @@ def list_datasets(root: str | Path) -> list[dict[str, Any]]:
     """The datasets below a folder: name, tasks, parts, complete, root, path; unreadable ones with `error`."""
     rows: list[dict[str, Any]] = []
     for file in sorted(Path(root).glob(f"**/{MANIFEST}")):
+        if STAGING in file.relative_to(root).parts:
+            continue  # parts on their way, such as those that a repair makes again
         try:
             manifest = read_manifest(file)
         except ManifestError as error:

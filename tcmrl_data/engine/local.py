@@ -1,6 +1,5 @@
 """The local engine: a supervisor with one worker process per unit."""
 
-import os
 import queue
 import socket
 import threading
@@ -10,6 +9,7 @@ from typing import Any, final
 
 from tcmrl_data.engine._attempt import Outcome, run_attempt
 from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
+from tcmrl_data.foundation.machine import available_cores
 
 
 @final
@@ -25,7 +25,7 @@ class LocalEngine(BaseEngine):
         def run_unit(unit: Unit) -> Result:
             return _run_attempts(unit, lambda message: events.put((unit.id, message)), stopping)
 
-        pool = ThreadPoolExecutor(self.workers or os.cpu_count() or 1)
+        pool = ThreadPoolExecutor(self.workers or available_cores())
         try:
             for unit in longest_first(units):
                 pool.submit(run_unit, unit).add_done_callback(events.put)

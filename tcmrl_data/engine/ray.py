@@ -16,6 +16,7 @@ from typing import Any, final
 from tcmrl_data.engine._attempt import GRACE_SECONDS, Outcome, run_attempt
 from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
 from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.sizes import size
 
 LOST_RETRIES = 3
@@ -185,7 +186,7 @@ def _connect(ray: Any, workers: int | None, address: str | None) -> None:
         return
     ray.init(
         address="local",
-        num_cpus=workers or os.cpu_count(),
+        num_cpus=workers or available_cores(),
         object_store_memory=OBJECT_STORE_BYTES,
         include_dashboard=False,
         log_to_driver=False,

@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, make_folders, remove_abandoned, remove_tree
 from tcmrl_data.foundation.errors import CacheError, LockedError, StorageError
+from tcmrl_data.foundation.machine import available_memory
 from tcmrl_data.foundation.sizes import parse_bytes, size
 from tcmrl_data.sampling.cache_entry import (
     FORMAT,
@@ -54,14 +55,6 @@ class CacheEntry:
     bytes: int
     used: float
     in_use: bool
-
-
-def available_memory() -> int:
-    """Bytes of memory that can be had without swapping, as the kernel estimates them."""
-    for line in Path("/proc/meminfo").read_text().splitlines():
-        if line.startswith("MemAvailable:"):
-            return 1024 * int(line.split()[1])
-    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def cache_folder() -> Path:

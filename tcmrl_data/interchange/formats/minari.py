@@ -171,7 +171,7 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
         "algorithm_name": recipe.behavior["source"],
         "ref_min_score": references.uniform,
         "ref_max_score": _best(references)[1],
-        "num_episodes_average_score": recipe.rollouts.lanes,
+        "num_episodes_average_score": recipe.rollouts.episodes,
         "requirements": [f"{each}=={packages[each]}" for each in NEEDED_BY_TASKS if each in packages],
         "description": (
             f"Task {task.index} of {dataset.name} ({task.split}), parameters "

@@ -1,0 +1,72 @@
+"""What this process may use of the machine: its CPU affinity and the limits of its control group count."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+CGROUPS = Path("/sys/fs/cgroup")
+OWN_CGROUPS = Path("/proc/self/cgroup")
+
+
+def available_cores() -> int:
+    """Cores that this process may use, at least 1: the CPU affinity, capped by quotas of control groups."""
+    cores = len(os.sched_getaffinity(0))
+    return max(1, int(min([cores, *_cpu_quotas()])))
+
+
+def available_memory() -> int:
+    """Bytes that can be had without swapping, as the kernel estimates them, capped by control groups."""
+    return max(0, min([_machine_memory(), *_memory_quotas()]))
+
+
+def _machine_memory() -> int:
+    for line in Path("/proc/meminfo").read_text().splitlines():
+        if line.startswith("MemAvailable:"):
+            return 1024 * int(line.split()[1])
+    return os.sysconf("SC_AVPHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def _cpu_quotas() -> Iterator[float]:
+    """Cores' worth of time per period, of every group that limits it."""
+    for folder in _groups("cpu"):
+        words = _words(folder / "cpu.max") or [
+            *_words(folder / "cpu.cfs_quota_us"),
+            *_words(folder / "cpu.cfs_period_us"),
+        ]
+        if len(words) == 2 and words[0].isdecimal() and int(words[1]):
+            yield int(words[0]) / int(words[1])
+
+
+def _memory_quotas() -> Iterator[int]:
+    """Bytes left of the limit of every group that has one; cached file contents can be given up."""
+    names = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
+    for folder in _groups("memory"):
+        for limit, usage in names:
+            words = [*_words(folder / limit), *_words(folder / usage)]
+            if len(words) == 2 and words[0].isdecimal():
+                statistics = _words(folder / "memory.stat")
+                cached = dict(zip(statistics[::2], statistics[1::2], strict=False)).get("inactive_file", "0")
+                yield int(words[0]) - int(words[1]) + int(cached)
+
+
+def _groups(controller: str) -> Iterator[Path]:
+    """Folders of this process's control groups that hold a controller, and of the groups above them.
+
+    A line of /proc/self/cgroup is `number:controllers:path`; version 2 names no controllers. A container
+    often sees its own group as the root, whatever the path says.
+    """
+    lines = OWN_CGROUPS.read_text().splitlines() if OWN_CGROUPS.is_file() else []
+    for line in lines:
+        _, controllers, path = line.split(":", 2)
+        if controllers and controller not in controllers.split(","):
+            continue
+        root = CGROUPS / controllers if controllers else CGROUPS
+        group = Path(path.lstrip("/"))
+        yield from (root / place for place in (group, *group.parents))
+
+
+def _words(file: Path) -> list[str]:
+    try:
+        return file.read_text().split()
+    except OSError:
+        return []
