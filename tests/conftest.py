@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe
 from tests.namespace import has_only_loopback
-from tests.workers import MARK
+from tests.workers import MARK, ROOT
 
 TASKS = [0, 3, 40, 60, 99]
 TINY = (
@@ -28,10 +29,16 @@ TINY = (
 QUICK_TO_NOTICE = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_health_check_period_ms": "500",
-    "RAY_health_check_timeout_ms": "500",
+    "RAY_health_check_timeout_ms": "60000",
     "RAY_health_check_failure_threshold": "4",
 }
-"""Settings of Ray under which the loss of a machine is noticed in seconds."""
+"""Settings of Ray under which the loss of a machine, where nobody answers, is noticed in seconds.
+
+A machine that is only slow to answer is not taken for lost.
+"""
+
+settings.register_profile("unhurried", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("unhurried")
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -60,6 +67,7 @@ def mark() -> Iterator[str]:
     value = uuid.uuid4().hex
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(MARK, value)
+        patch.setenv("PYTHONPATH", str(ROOT))  # workers that Ray starts find `tests.directed` too
         yield value
 
 

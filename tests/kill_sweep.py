@@ -22,6 +22,8 @@ from tcmrl_data.foundation.disk import STAGING, lock_file, remove_abandoned
 from tcmrl_data.store.manifest import Manifest, part_folder, read_manifest
 
 MARK = "TCMRL_KILL_SWEEP"
+ORPHAN_SECONDS = 60.0
+"""A worker that still lives so long after its driver is an orphan."""
 
 
 @dataclass
@@ -62,14 +64,19 @@ def marked(mark: str) -> list[int]:
 def kill_once(
     process: "subprocess.Popen[bytes]", mark: str, seconds: float, figures: Figures, dice: random.Random
 ) -> None:
-    """Waits, kills the driver, a worker or all of them, and sees that nobody outlives the driver."""
+    """Waits, kills the driver, a worker or all of them, and sees that nobody outlives the driver.
+
+    Where a worker shall die, the time is counted from when one lives.
+    """
+    what = dice.choice(["driver", "worker", "all"])
+    while what != "driver" and process.poll() is None and len(marked(mark)) < 2:
+        time.sleep(0.02)
     try:
         process.wait(timeout=seconds)
         return
     except subprocess.TimeoutExpired:
         pass
     workers = [pid for pid in marked(mark) if pid != process.pid]
-    what = dice.choice(["driver", "worker", "all"])
     victims = {"driver": [process.pid], "worker": workers[:1], "all": [process.pid, *workers]}[what]
     for pid in victims:
         try:
@@ -82,7 +89,7 @@ def kill_once(
     if process.pid not in victims:
         return
     process.wait()
-    deadline = time.monotonic() + 10
+    deadline = time.monotonic() + ORPHAN_SECONDS
     while marked(mark) and time.monotonic() < deadline:
         time.sleep(0.02)
     for orphan in marked(mark):

@@ -1,8 +1,6 @@
 import json
 import os
 import subprocess
-import sys
-import time
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import final
@@ -82,26 +80,6 @@ def test_a_second_build_does_only_what_is_missing(
     report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS, workers=1)
     assert (report.built, report.present) == (1, 14)
     assert ids(folder) == ids(tiny_folder)
-
-
-def test_a_killed_build_resumes_to_the_same_data(tiny_folder: Path, tmp_path: Path) -> None:
-    out = tmp_path / "killed"
-    script = (
-        "import sys, tcmrl_data; from pathlib import Path; from tests.conftest import TINY, TASKS;"
-        "recipe = tcmrl_data.load_recipe('point-robot', profile='quick', overrides=TINY);"
-        "tcmrl_data.build_dataset(recipe, Path(sys.argv[1]), tasks=TASKS, workers=2)"
-    )
-    root = Path(__file__).parents[1]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(root), os.environ.get("PYTHONPATH", "")])}
-    driver = subprocess.Popen([sys.executable, "-c", script, str(out)], cwd=root, env=environment)
-    deadline = time.monotonic() + 60
-    while not list(out.glob("tasks/*/snapshots/*/part.json")) and time.monotonic() < deadline:
-        time.sleep(0.01)
-    driver.kill()
-    driver.wait()
-    subprocess.run([sys.executable, "-c", script, str(out)], cwd=root, env=environment, check=True)
-    assert ids(out) == ids(tiny_folder)
-    assert read_manifest(out).complete
 
 
 def test_another_recipe_or_seed_is_refused(tiny_copy: Copy, tiny_recipe: Recipe) -> None:

@@ -6,9 +6,10 @@ import sys
 from pathlib import Path
 
 import pytest
-from tcmrl_cli.frame import duration, size
+from tcmrl_cli.frame import duration
 from tcmrl_cli.progress import Pace, StageProgress
 
+from tcmrl_data.foundation.sizes import size
 from tests.conftest import TINY
 from tests.terminal import assert_fits, show_in_terminal
 

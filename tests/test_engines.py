@@ -26,7 +26,8 @@ from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import part_folder, read_manifest
 from tests.conftest import TASKS, TINY
-from tests.workers import ROOT, command_line, killer, wait_for, worker_pids
+from tests.directed import Directions
+from tests.workers import PATIENCE, ROOT, command_line, wait_for, worker_pids
 
 CASES = [
     pytest.param(name, marks=[pytest.mark.loopback] if engine.takes_address else [])
@@ -35,6 +36,11 @@ CASES = [
 
 LONG = (*TINY, "behavior.sac.steps=100000", "behavior.sac.snapshots=[0,100,100000]")
 """Units that take minutes: they end in time only if they are ended."""
+
+
+@pytest.fixture(scope="module")
+def long_recipe() -> Recipe:
+    return load_recipe("point-robot", profile="quick", overrides=LONG)
 
 
 @dataclass(frozen=True)
@@ -61,6 +67,11 @@ def engine(request: pytest.FixtureRequest, mark: str) -> EngineCase:
     networked = ENGINES.get(request.param).takes_address
     address = request.getfixturevalue("ray_cluster").address if networked else None
     return EngineCase(request.param, address, mark)
+
+
+@pytest.fixture
+def directions(tmp_path: Path) -> Directions:
+    return Directions(str(tmp_path / "directions"))
 
 
 def make_units(recipe: Recipe, out: Path, tasks: list[int]) -> list[Unit]:
@@ -111,14 +122,20 @@ def test_digests_do_not_depend_on_workers_or_order(
 
 
 def test_a_killed_worker_is_replaced_and_the_data_are_the_same(
-    engine: EngineCase, tiny_folder: Path, tiny_recipe: Recipe, tmp_path: Path
+    engine: EngineCase,
+    tiny_folder: Path,
+    tiny_recipe: Recipe,
+    directions: Directions,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     out = tmp_path / "data"
-    with killer(engine.mark, lambda: has_part(out, 0, 0) and not has_part(out, 0, 150), kills=1) as killed:
-        report = tcmrl_data.build_dataset(
-            tiny_recipe, out, tasks=[0], workers=1, engine=engine.name, address=engine.address
-        )
-    assert len(killed) == 1
+    killed = replace(directions, deaths=1)
+    killed.install(monkeypatch)
+    report = tcmrl_data.build_dataset(
+        tiny_recipe, out, tasks=[0], workers=1, engine=engine.name, address=engine.address
+    )
+    assert len(killed.died()) == 1
     assert (report.failed, report.built) == ((), 3)
     assert ids(out) == ids(tiny_folder, 0)
     assert read_manifest(out).complete
@@ -138,9 +155,9 @@ def test_an_error_that_a_unit_reports_is_final_and_the_others_are_done(
 
 
 def test_a_unit_out_of_time_is_ended_and_tried_once_more(
-    engine: EngineCase, tiny_recipe: Recipe, tmp_path: Path
+    engine: EngineCase, long_recipe: Recipe, tmp_path: Path
 ) -> None:
-    (unit,) = make_units(tiny_recipe, tmp_path / "data", [3])
+    (unit,) = make_units(long_recipe, tmp_path / "data", [3])
     (result,) = run(engine, [replace(unit, timeout=0.2)]).values()
     assert result == Result(
         "task 3", False, None, "ran longer than its 0.2 s (build.timeout)", 2, result.node
@@ -172,21 +189,17 @@ def test_a_unit_run_twice_at_once_makes_its_data_once(
 
 
 def test_a_poison_unit_is_named_the_others_are_done_and_the_exit_code_is_1(
-    engine: EngineCase, tiny_folder: Path, tmp_path: Path
+    engine: EngineCase, tiny_folder: Path, directions: Directions, tmp_path: Path
 ) -> None:
-    """One worker at a time: those that live after task 0 is done, and before task 40 begins, have task 3."""
+    """Whoever works on task 3 is killed after its next part; what was published before stays."""
     out = tmp_path / "data"
-    with (
-        killer(engine.mark, lambda: has_part(out, 3, 0), kills=1) as first,
-        command_line(*engine.command(out, tasks="0,3,40", workers=1)) as driver,
-    ):
-        wait_for(lambda: first or driver.poll() is not None, "the first kill")
-        with killer(engine.mark, lambda: True, kills=1) as second:
-            _, errors = driver.communicate(timeout=120)
-    assert (len(first), len(second), driver.returncode) == (1, 1, 1)
+    poison = replace(directions, unit="task 3", deaths=2)
+    with command_line(*engine.command(out, tasks="0,3,40", workers=2), directions=poison) as driver:
+        _, errors = driver.communicate(timeout=PATIENCE)
+    assert (len(poison.died()), driver.returncode) == (2, 1), errors
     assert "Error: task 3 failed after 2 attempt(s) on " in errors
     assert "killed by signal 9" in errors
-    assert ids(out, 0, 40) == ids(tiny_folder, 0, 40)
+    assert ids(out) == {key: each for key, each in ids(tiny_folder, 0, 3, 40).items() if key != (3, 150)}
     assert not read_manifest(out).complete
 
 
@@ -207,7 +220,7 @@ def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
         wait_for(lambda: has_part(out, 0, 0) or has_part(out, 3, 0) or driver.poll() is not None, "a part")
         assert all(os.getpgid(pid) != driver.pid for pid in worker_pids(engine.mark))
         os.killpg(driver.pid, number)  # to all of the group, as a terminal does
-        _, errors = driver.communicate(timeout=60)
+        _, errors = driver.communicate(timeout=PATIENCE)
     told = [line for line in errors.splitlines() if line.startswith("Error:")]
     again = shlex.join(["tcmrl-data", *command, "--quiet"])
     assert told == [f"Error: interrupted; {out} keeps what is finished, to go on run `{again}` again"]
@@ -220,50 +233,53 @@ def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
 
 
 def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
-    engine: EngineCase, tiny_folder: Path, tmp_path: Path
+    engine: EngineCase, tiny_folder: Path, directions: Directions, tmp_path: Path
 ) -> None:
     out = tmp_path / "data"
     command = engine.command(out, tasks="0", workers=1)
-    with command_line(*command) as driver:
-        wait_for(lambda: has_part(out, 0, 0) or driver.poll() is not None, "a part")
-        assert worker_pids(engine.mark)
+    with command_line(*command, directions=directions.hold()) as driver:
+        directions.wait(driver)
+        assert directions.waiting() == set(worker_pids(engine.mark))
         driver.kill()
         driver.wait()
-        wait_for(lambda: not worker_pids(engine.mark), "the end of the workers", seconds=20)
-    assert not has_part(out, 0, 150)
+        wait_for(lambda: not worker_pids(engine.mark), "the end of the workers")
+    assert has_part(out, 0, 0) and not has_part(out, 0, 100)
     with command_line(*command) as driver:
-        _, errors = driver.communicate(timeout=120)
+        _, errors = driver.communicate(timeout=PATIENCE)
     assert (driver.returncode, ids(out)) == (0, ids(tiny_folder, 0)), errors
 
 
-def test_a_worker_ends_with_its_driver(tiny_recipe: Recipe, tmp_path: Path) -> None:
-    """That is, when its input closes, long before it has anything to say."""
-    (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
+def test_a_worker_ends_with_its_driver(long_recipe: Recipe, tmp_path: Path) -> None:
+    """That is, when its input closes, long before its unit is done."""
+    (unit,) = make_units(long_recipe, tmp_path / "data", [40])
     command = [sys.executable, "-m", WORKER]
     worker = subprocess.run(
         command, cwd=ROOT, text=True, input=json.dumps(unit.spec) + "\n", capture_output=True, check=False
     )
-    assert (worker.returncode, worker.stdout) == (1, "")
-    assert list((tmp_path / "data").rglob("part.json")) == []
+    assert worker.returncode == 1
+    assert "result" not in worker.stdout
+    assert not has_part(tmp_path / "data", 40, 100_000)
 
 
 def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_done(
-    tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
+    tiny: Dataset, tiny_recipe: Recipe, directions: Directions, tmp_path: Path
 ) -> None:
     (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
-    command = [sys.executable, "-m", WORKER]
+    halfway = replace(directions, at="publishing").hold()
+    directed = halfway.direct(unit)
+    command = [sys.executable, "-m", directed.worker]
     with subprocess.Popen(
         command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as worker:
         assert worker.stdin is not None
-        worker.stdin.write(json.dumps(unit.spec) + "\n")
+        worker.stdin.write(json.dumps(directed.spec) + "\n")
         worker.stdin.flush()
-        wait_for(lambda: list((tmp_path / "data" / STAGING).glob("task_*[!k]")), "a staged part")
+        halfway.wait(worker)
+        assert len(staged(tmp_path / "data")) == 2  # a half written part and its lock
         worker.terminate()
-        assert worker.wait(30) == 128 + signal.SIGTERM
+        assert worker.wait(PATIENCE) == 128 + signal.SIGTERM
     assert staged(tmp_path / "data") == []
-    published = {path.parent.name for path in (tmp_path / "data").rglob("part.json")}
-    assert published <= {"step_0000000"}
+    assert list((tmp_path / "data").rglob("part.json")) == []
     assert run(EngineCase("local", None, ""), [unit])["task 40"].digest == reference(tiny, 40)
 
 

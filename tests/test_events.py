@@ -1,15 +1,17 @@
 import json
 import os
-import subprocess
-import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
+
 from tcmrl_data import build_status
+from tcmrl_data.build import events
 from tcmrl_data.build.events import EVENTS, TAIL_BYTES, BuildEvent, EventLog
 from tcmrl_data.foundation.disk import LOCK, lock_file
 from tests.conftest import TINY
+from tests.directed import Directions
+from tests.workers import PATIENCE, command_line
 
 Copy = Callable[[], Path]
 
@@ -26,7 +28,16 @@ def test_a_finished_build_says_so(tiny_folder: Path) -> None:
     assert (kinds[0], kinds[-1], kinds.count("part"), kinds.count("unit_done")) == ("start", "end", 15, 5)
 
 
-def test_running_failed_and_rate_come_from_the_latest_build(tiny_copy: Copy) -> None:
+def stop_the_clock(patch: pytest.MonkeyPatch) -> Callable[[float], None]:
+    """Makes the record's clock stand; returns what moves it to a second."""
+    now = [1000.0]
+    patch.setattr(events.time, "time", lambda: now[0])
+    return lambda second: now.__setitem__(0, 1000.0 + second)
+
+
+def test_running_failed_and_rate_come_from_the_latest_build(
+    tiny_copy: Copy, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = tiny_copy()
     lines = [
         event("start"),
@@ -35,6 +46,7 @@ def test_running_failed_and_rate_come_from_the_latest_build(tiny_copy: Copy) -> 
         event("part", "task 8"),
     ]
     lines += [event("unit_failed", "task 7", 100, "task 7 failed: why"), event("steps", "task 9", 150)]
+    stop_the_clock(monkeypatch)
     with EventLog(folder, lambda _: None) as log:
         for each in lines:
             log.write(each)
@@ -53,31 +65,33 @@ def test_running_failed_and_rate_come_from_the_latest_build(tiny_copy: Copy) -> 
     assert busy.seconds_left is not None
 
 
-def test_steps_are_recorded_at_most_once_a_second_but_all_are_reported(tmp_path: Path) -> None:
+def test_steps_are_recorded_at_most_once_a_second_but_all_are_reported(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     reported: list[BuildEvent] = []
+    set_clock = stop_the_clock(monkeypatch)
     with EventLog(tmp_path, reported.append) as log:
         for steps in range(50):
+            set_clock(steps / 10)
             log.write(event("steps", "task 1", steps))
     assert len(reported) == 50
-    assert 1 <= len((tmp_path / EVENTS).read_text().splitlines()) < 50
+    recorded = [json.loads(line)["steps_done"] for line in (tmp_path / EVENTS).read_text().splitlines()]
+    assert recorded == [0, 10, 20, 30, 40]
 
 
 def test_status_of_a_running_build_from_another_process(tmp_path: Path) -> None:
-    out = tmp_path / "running"
-    start = "from tcmrl_cli.data import main; main()"
+    out, directions = tmp_path / "running", Directions(str(tmp_path / "directions")).hold()
     options = ["--profile", "quick", "--tasks", "0,3", "--workers", "1", "--quiet", "--out", str(out)]
     options += [word for each in TINY for word in ("--set", each)]
-    with subprocess.Popen([sys.executable, "-c", start, "build", "point-robot", *options]) as builder:
-        deadline = time.monotonic() + 60
-        while not (out / EVENTS).is_file() and time.monotonic() < deadline:
-            time.sleep(0.02)
-        shown = subprocess.run(
-            [sys.executable, "-c", start, "status", str(out), "--json"], capture_output=True, check=True
-        )
-        document = json.loads(shown.stdout)
+    with command_line("build", "point-robot", *options, directions=directions) as builder:
+        directions.wait(builder)
+        with command_line("status", str(out), "--json") as asker:
+            document = json.loads(asker.communicate(timeout=PATIENCE)[0])
         assert document["builder"].startswith(f"process {builder.pid} on ")
+        assert document["running"] == ["task 0"]
         assert document["parts_total"] == 6
-        assert builder.wait() == 0
+        directions.release()
+        assert builder.wait(PATIENCE) == 0
     assert build_status(out).complete
 
 

@@ -27,7 +27,8 @@ MEMORY_RATIO = 8
 ADDRESS_SPACE = 2**30
 """What a case may at most ask for, touched or not; a larger request fails as it would on a full machine."""
 
-SECONDS = 30
+SECONDS = 240
+"""After which a case counts as blocked; the slowest takes a few."""
 opened: list[str] = []
 watching = False
 

@@ -16,7 +16,7 @@ from tcmrl_algo.training.train import Progress
 from tcmrl_data import Dataset
 from tests.commands import Call, assert_refused, in_process
 from tests.test_train import SMALL, config_of
-from tests.workers import command_line, wait_for
+from tests.workers import PATIENCE, command_line, wait_for
 
 SETTINGS = [argument for text in SMALL for argument in ("--set", text)]
 
@@ -81,7 +81,7 @@ def test_the_command_that_an_interrupted_training_prints_goes_on(
         wait_for(lambda: _logged(folder), "training")
         for _ in range(4):
             process.send_signal(number)
-        output, errors = process.communicate(timeout=60)
+        output, errors = process.communicate(timeout=PATIENCE)
     step = open_run(folder).newest().step
     line = errors.strip().splitlines()[-1]
     assert (process.returncode, output) == (1, "")
@@ -103,7 +103,7 @@ def test_four_quick_interrupts_of_a_build_give_one_line(tmp_path: Path) -> None:
         for _ in range(4):
             process.send_signal(signal.SIGINT)
             time.sleep(0.05)
-        output, errors = process.communicate(timeout=60)
+        output, errors = process.communicate(timeout=PATIENCE)
     assert (process.returncode, output) == (1, "")
     assert "Traceback" not in errors
     assert errors.strip().splitlines()[-1].startswith(f"Error: interrupted; {folder} keeps what is finished")

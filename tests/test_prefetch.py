@@ -1,12 +1,12 @@
 """Making batches ahead: order, bound, errors, and the end of the thread."""
 
 import threading
-import time
 
 import pytest
 
 from tcmrl_data import BatchRequest, Prefetch, Trajectories, Transitions
 from tests.sampling import numbered_tasks, sampler_of
+from tests.workers import wait_for
 
 
 def threads() -> int:
@@ -37,14 +37,18 @@ def test_batches_are_the_same_whatever_the_depth(depth: int) -> None:
 
 
 def test_no_more_are_made_than_the_depth_and_the_one_at_work() -> None:
-    made: list[int] = []
-    with Prefetch(lambda n: made.append(n) or n, range(100), depth=2) as items:
-        assert next(items) == 0
-        deadline = time.monotonic() + 10
-        while len(made) < 4 and time.monotonic() < deadline:
-            time.sleep(0.001)
-        time.sleep(0.02)
-        assert made == [0, 1, 2, 3]  # one taken, two waiting, one made and not put
+    """Those that were taken or asked for, two that wait, and one that is made and not put."""
+    asked, ahead = 0, []
+
+    def make(n: int) -> int:
+        ahead.append(n + 1 - asked)
+        return n
+
+    with Prefetch(make, range(100), depth=2) as items:
+        for asked in range(1, 101):
+            assert next(items) == asked - 1
+            wait_for(lambda: len(ahead) == min(asked + 3, 100), "the thread to go ahead")  # noqa: B023
+    assert max(ahead) == 3
 
 
 @pytest.mark.parametrize("depth", [0, 2])

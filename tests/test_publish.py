@@ -212,12 +212,12 @@ def test_a_folder_that_stands_there_is_left_alone(tmp_path: Path) -> None:
 
 
 HOLD = """
-import sys, time
+import sys
 from pathlib import Path
 from tcmrl_data.foundation.disk import lock_file
 with lock_file(Path(sys.argv[1]), "the attempt"):
     print("held", flush=True)
-    time.sleep(60)
+    sys.stdin.read()
 """
 
 
@@ -229,7 +229,10 @@ def test_gc_never_removes_a_live_attempt(tmp_path: Path) -> None:
     (staging / "lost.4.lock").unlink()
     (staging / "manifest.json.3").touch()
     holder = subprocess.Popen(
-        [sys.executable, "-c", HOLD, str(staging / "live.1.lock")], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", HOLD, str(staging / "live.1.lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
     )
     with holder:
         assert holder.stdout is not None

@@ -4,9 +4,9 @@ import os
 import re
 import signal
 import sys
-import threading
-import time
+import uuid
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +15,12 @@ import pytest
 import tcmrl_data
 from tcmrl_data import BuildEvent, Recipe, load_recipe
 from tcmrl_data.engine.base import ATTEMPTS, Unit
-from tcmrl_data.engine.ray import Engine
+from tcmrl_data.engine.ray import RayEngine
 from tcmrl_data.foundation.errors import BuildError
-from tcmrl_data.store.manifest import part_folder, read_manifest
+from tcmrl_data.store.manifest import read_manifest
 from tests.conftest import TASKS, TINY
-from tests.workers import ancestors, command_line, marked_pids, wait_for, worker_pids
+from tests.directed import Directions
+from tests.workers import PATIENCE, ancestors, command_line, marked_pids, wait_for, worker_pids
 
 loopback = pytest.mark.loopback
 
@@ -40,9 +41,16 @@ def second_machine(ray_cluster: Any) -> Iterator[Any]:
 
 @loopback
 def test_a_cluster_that_loses_a_machine_ends_with_the_same_data(
-    ray_cluster: Any, second_machine: Any, mark: str, tiny_folder: Path, tmp_path: Path
+    ray_cluster: Any,
+    second_machine: Any,
+    mark: str,
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Three cores a unit: one unit runs on each machine at a time."""
+    """Three cores a unit: one unit runs on each machine at a time, and waits after its first part."""
+    directions = Directions(str(tmp_path / "directions")).hold()
+    directions.install(monkeypatch)
     recipe = load_recipe("point-robot", profile="quick", overrides=[*TINY, "build.cpus=3"])
     (raylet,) = second_machine.all_processes["raylet"]
     lost: list[int] = []
@@ -53,6 +61,7 @@ def test_a_cluster_that_loses_a_machine_ends_with_the_same_data(
         if event.kind == "part" and there and not lost:
             lost.extend(there)
             ray_cluster.remove_node(second_machine, allow_graceful=False)
+            directions.release()
 
     report = tcmrl_data.build_dataset(
         recipe, tmp_path / "data", tasks=[0, 3, 40], engine="ray", address=ray_cluster.address, progress=lose
@@ -64,24 +73,34 @@ def test_a_cluster_that_loses_a_machine_ends_with_the_same_data(
 
 @loopback
 def test_a_supervisor_that_is_killed_is_replaced_by_ray(
-    ray_cluster: Any, mark: str, tiny_recipe: Recipe, tiny_folder: Path, tmp_path: Path
+    ray_cluster: Any,
+    mark: str,
+    tiny_recipe: Recipe,
+    tiny_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Its worker ends with it; Ray makes the same attempt again, more often than the engine tries a crash."""
-    out, killed = tmp_path / "data", []
+    out, directions = tmp_path / "data", Directions(str(tmp_path / "directions")).hold()
+    directions.install(monkeypatch)
 
-    def watch() -> None:
-        while len(killed) < ATTEMPTS and not (out / part_folder(0, 150)).exists():
-            for pid in set(worker_pids(mark)) - set(killed):
-                killed.append(pid)
-                os.kill(ancestors(pid)[0], signal.SIGKILL)
-                wait_for(lambda: not set(killed) & set(worker_pids(mark)), "the worker's end", seconds=10)
-            time.sleep(0.01)
+    def kill_supervisors() -> None:
+        killed: set[int] = set()
+        for _ in range(ATTEMPTS):
+            wait_for(lambda: directions.waiting() - killed, "a worker that waits")
+            (worker,) = directions.waiting() - killed
+            killed.add(worker)
+            os.kill(ancestors(worker)[0], signal.SIGKILL)
+            wait_for(lambda: not worker_pids(mark), "the worker's end")
+        directions.release()
 
-    thread = threading.Thread(target=watch)
-    thread.start()
-    report = tcmrl_data.build_dataset(tiny_recipe, out, tasks=[0], engine="ray", address=ray_cluster.address)
-    thread.join()
-    assert len(killed) == ATTEMPTS
+    with ThreadPoolExecutor(1) as pool:
+        killing = pool.submit(kill_supervisors)
+        report = tcmrl_data.build_dataset(
+            tiny_recipe, out, tasks=[0], engine="ray", address=ray_cluster.address
+        )
+        killing.result()
+    assert len(directions.waiting()) > ATTEMPTS
     assert (report.failed, report.built) == ((), 3)
     assert ids(out) == ids(tiny_folder, 0)
 
@@ -111,26 +130,27 @@ def test_what_the_cluster_can_never_place_is_refused_at_once(
 
 @loopback
 def test_without_an_address_a_cluster_is_started_for_the_build_and_ended_with_it(
-    mark: str, tiny_folder: Path, tmp_path: Path
+    tiny_folder: Path, tmp_path: Path
 ) -> None:
-    before = set(marked_pids(mark))
+    own = uuid.uuid4().hex
     settings = [argument for override in TINY for argument in ("--set", override)]
     command = ["build", "point-robot", "--profile", "quick", *settings, "--tasks", "3", "--engine", "ray"]
-    with command_line(*command, "--workers", "1", "--out", str(tmp_path / "data"), "--json") as driver:
-        _, errors = driver.communicate(timeout=120)
+    command += ["--workers", "1", "--out", str(tmp_path / "data"), "--json"]
+    with command_line(*command, mark=own) as driver:
+        _, errors = driver.communicate(timeout=PATIENCE)
     assert driver.returncode == 0, errors
     assert ids(tmp_path / "data") == ids(tiny_folder, 3)
-    wait_for(lambda: set(marked_pids(mark)) <= before, "the end of the cluster", seconds=20)
+    wait_for(lambda: not marked_pids(own), "the end of the cluster")
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere"])
 def test_an_address_where_nobody_answers_is_refused_at_once(address: str) -> None:
     pytest.importorskip("ray")
     with pytest.raises(BuildError, match=f"no connection to a Ray cluster at {address}: .*ray start --head"):
-        next(Engine(address=address).run([Unit("task 3", {}, "nothing")], lambda unit, message: None))
+        next(RayEngine(address=address).run([Unit("task 3", {}, "nothing")], lambda unit, message: None))
 
 
 def test_without_the_package_the_remedy_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(BuildError, match=re.escape("pip install 'tcmrl[ray]'")):
-        next(Engine().run([Unit("task 3", {}, "nothing")], lambda unit, message: None))
+        next(RayEngine().run([Unit("task 3", {}, "nothing")], lambda unit, message: None))

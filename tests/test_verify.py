@@ -350,7 +350,7 @@ def test_gc_spares_a_live_attempt_and_is_refused_during_a_build(tiny_copy: Copy)
     folder = tiny_copy()
     littered(folder)
     attempt = folder / STAGING / "task_00003.dead"
-    holder = "import sys, time; from tcmrl_data.foundation.disk import lock_file; from pathlib import Path\n"
+    holder = "import sys; from tcmrl_data.foundation.disk import lock_file; from pathlib import Path\n"
     holder += "with lock_file(Path(sys.argv[1]), 'x'):\n    print('held', flush=True)\n    sys.stdin.read()"
     for lock, is_refused in ((attempt.with_name("task_00003.dead.lock"), False), (folder / LOCK, True)):
         command = [sys.executable, "-c", holder, str(lock)]

@@ -1,22 +1,33 @@
-"""Finding worker processes from outside, to kill them: Linux tells by /proc."""
+"""Processes of builds: finding them from outside, which Linux tells by /proc, and starting them."""
 
 import contextlib
 import os
-import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from tests.directed import Directions
 
 MARK = "TCMRL_TEST_MARK"
 ROOT = Path(__file__).parents[1]
+PATIENCE = 240.0
+"""Seconds after which what is waited for counts as hanging; nothing depends on how long it takes."""
+WORKERS = (b"tcmrl_data.build.worker", b"tests.directed")
 
 
 def worker_pids(mark: str) -> list[int]:
     """Live worker processes that inherited a mark in their environment."""
-    return [pid for pid in marked_pids(mark) if b"tcmrl_data.build.worker" in _read(pid, "cmdline")]
+    return [pid for pid in marked_pids(mark) if _module(pid) in WORKERS]
+
+
+def _module(pid: int) -> bytes:
+    """The module that a process was started with, by `python -m`."""
+    _, _, module = (*_read(pid, "cmdline").split(b"\0"), b"", b"", b"")[:3]
+    return module
 
 
 def marked_pids(mark: str) -> list[int]:
@@ -36,48 +47,42 @@ def ancestors(pid: int) -> list[int]:
     return found
 
 
-def wait_for(condition: Callable[[], object], what: str, seconds: float = 60.0) -> None:
-    """Waits until something is so."""
-    deadline = time.monotonic() + seconds
+def wait_for(condition: Callable[[], object], what: str) -> None:
+    """Waits until something is so; the deadline only ends what would hang."""
+    deadline = time.monotonic() + PATIENCE
     while not condition():
-        assert time.monotonic() < deadline, f"{what}: not within {seconds} s"
+        assert time.monotonic() < deadline, f"{what}: not within {PATIENCE:g} s"
         time.sleep(0.005)
 
 
 @contextlib.contextmanager
-def killer(mark: str, when: Callable[[], object], kills: int) -> Iterator[list[int]]:
-    """Kills the first marked workers that live while `when` holds; yields the list of their pids."""
-    killed: list[int] = []
-    over = threading.Event()
-
-    def watch() -> None:
-        while len(killed) < kills and not over.is_set():
-            victims = set(worker_pids(mark)) - set(killed) if when() else set()
-            for pid in list(victims)[: kills - len(killed)]:
-                os.kill(pid, signal.SIGKILL)
-                killed.append(pid)
-            time.sleep(0.005)
-
-    thread = threading.Thread(target=watch)
-    thread.start()
-    try:
-        yield killed
-    finally:
-        over.set()
-        thread.join()
-
-
-@contextlib.contextmanager
-def command_line(*arguments: str, program: str = "tcmrl-data") -> Iterator["subprocess.Popen[str]"]:
+def command_line(
+    *arguments: str,
+    program: str = "tcmrl-data",
+    directions: "Directions | None" = None,
+    mark: str | None = None,
+) -> Iterator["subprocess.Popen[str]"]:
     """A running `tcmrl-data` or `tcmrl` in a session of its own, killed at the end if it still runs.
 
     It hears Ctrl-C even where the tests themselves run in the background of a shell, which ignores it.
+
+    Args:
+        arguments: what follows the program's name.
+        program: `tcmrl-data` or `tcmrl`.
+        directions: for the workers that it starts.
+        mark: stands in the environment of its processes instead of the session's.
     """
-    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)"
-    code += f"; from tcmrl_cli.{'data' if program == 'tcmrl-data' else 'train'} import main; main()"
+    code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    code += f"from tcmrl_cli.{'data' if program == 'tcmrl-data' else 'train'} import main\n"
+    code += (
+        f"from tests.directed import Directions, run_directed; run_directed(main, {directions!r})"
+        if directions
+        else "main()"
+    )
     with subprocess.Popen(
         [sys.executable, "-c", code, *arguments],
         cwd=ROOT,
+        env=os.environ | ({MARK: mark} if mark else {}),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,

@@ -1,0 +1,134 @@
+"""Workers that die or wait at a chosen place, so that no test has to hit a moment.
+
+A unit's spec carries the directions; files in a folder count what happened. As a program: such a worker.
+"""
+
+import importlib
+import os
+import signal
+import subprocess
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import pytest
+
+from tcmrl_data.engine.base import Unit
+from tcmrl_data.foundation import disk
+from tests.workers import wait_for
+
+BUILD, EXPERIMENT = "tcmrl_data.build.driver", "tcmrl_algo.experiment.driver"
+"""The modules that make units."""
+
+WORK = {
+    BUILD: ("tcmrl_data.build.worker", "_build_parts"),
+    EXPERIMENT: ("tcmrl_algo.experiment.job", "_serve"),
+}
+"""What the workers of their units do."""
+
+Report = Callable[[Mapping[str, Any]], None]
+
+
+@dataclass(frozen=True)
+class Directions:
+    """What becomes of the workers of some units.
+
+    Attributes:
+        folder: holds a file for every death, one for every worker that waits, and `hold` while they shall.
+        at: `part` after a worker told of a part, `steps` after it told of steps, `publishing` when it has
+            written half of a part.
+        passes: how often a worker gets by that place first.
+        deaths: how many workers are killed there, all units together; those after them wait.
+        unit: the one unit that is meant, or all.
+        driver: the module that makes the units.
+    """
+
+    folder: str
+    at: Literal["part", "steps", "publishing"] = "part"
+    passes: int = 0
+    deaths: int = 0
+    unit: str | None = None
+    driver: str = BUILD
+
+    def hold(self) -> "Directions":
+        """Makes workers wait until `release`."""
+        Path(self.folder).mkdir(exist_ok=True)
+        (Path(self.folder) / "hold").touch()
+        return self
+
+    def release(self) -> None:
+        """Lets workers go on."""
+        (Path(self.folder) / "hold").unlink()
+
+    def died(self) -> set[int]:
+        """Process ids of the workers that were killed."""
+        return {int(file.suffix[1:]) for file in Path(self.folder).glob("died.*")}
+
+    def waiting(self) -> set[int]:
+        """Process ids of the workers that wait, or waited."""
+        return {int(file.suffix[1:]) for file in Path(self.folder).glob("waiting.*")}
+
+    def direct(self, unit: Unit) -> Unit:
+        """The unit with these directions, if it is meant."""
+        if self.unit not in (None, unit.id):
+            return unit
+        Path(self.folder).mkdir(exist_ok=True)
+        return replace(unit, worker=__name__, spec={**unit.spec, "directions": asdict(self)})
+
+    def install(self, patch: pytest.MonkeyPatch) -> None:
+        """Gives these directions to every unit that this process makes."""
+        made = importlib.import_module(self.driver)
+        patch.setattr(made, "Unit", lambda *values, **named: self.direct(Unit(*values, **named)))
+
+    def wait(self, driver: "subprocess.Popen[str]", workers: int = 1) -> None:
+        """Waits until so many workers wait, or the process that drives them has ended."""
+        wait_for(lambda: len(self.waiting()) >= workers or driver.poll() is not None, "workers that wait")
+        assert driver.poll() is None, driver.communicate()
+
+    def obey(self) -> None:
+        """Dies or waits here, as directed."""
+        folder = Path(self.folder)
+        if len(self.died()) < self.deaths:
+            (folder / f"died.{os.getpid()}").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        (folder / f"waiting.{os.getpid()}").touch()
+        while (folder / "hold").exists():
+            time.sleep(0.005)
+
+
+def _work(spec: dict[str, Any], report: Report) -> str:
+    directions = Directions(**spec.pop("directions"))
+    left = directions.passes
+
+    class HalfWritten(disk.Disk):
+        def write(self, path: Path, data: bytes) -> None:
+            super().write(path, data)
+            if directions.at == "publishing" and disk.STAGING in path.parts and path.name == "policy.json":
+                directions.obey()
+
+    def report_and_obey(message: Mapping[str, Any]) -> None:
+        nonlocal left
+        report(message)
+        if message["kind"] == directions.at:
+            if not left:
+                directions.obey()
+            left = max(0, left - 1)
+
+    disk.disk = HalfWritten()
+    module, function = WORK[directions.driver]
+    digest: str = getattr(importlib.import_module(module), function)(spec, report_and_obey)
+    return digest
+
+
+def run_directed(main: Callable[[], object], directions: Directions) -> None:
+    """Runs a command line whose units get directions."""
+    directions.install(pytest.MonkeyPatch())
+    main()
+
+
+if __name__ == "__main__":
+    from tcmrl_data.engine.worker import serve
+
+    serve(_work)
