@@ -16,7 +16,9 @@ def test_a_cheetah_that_stands_still_returns_minus_305() -> None:
     environment, tasks = environment_of("half-cheetah-vel"), list(parameters_of("half-cheetah-vel"))
     velocities = np.array([each["velocity"] for each in tasks])
     assert velocities.min() >= 0.0 and velocities.max() <= 3.0
-    returns = [each.undiscounted_return for each in episodes(environment, Still(), tasks)]
+    played = episodes(environment, Still(), tasks)
+    assert not any(episode.terminated.any() for episode in played)
+    returns = [episode.undiscounted_return for episode in played]
     assert np.mean(returns) == pytest.approx(-305, abs=2)
     assert returns == pytest.approx((-200 * velocities).tolist(), abs=30)
 

@@ -52,6 +52,16 @@ def test_sparse_rewards_in_both_readings(reading: str, inside: float, oracle: fl
     assert np.mean(returns) == pytest.approx(oracle, abs=0.02)
 
 
+@pytest.mark.parametrize("name", ["point-robot", "point-robot-wind", "sparse-point-robot"])
+def test_a_point_robot_never_terminates_not_even_at_its_goal(name: str) -> None:
+    environment, tasks = environment_of(name), list(parameters_of(name)[:5])
+    controller = environment.oracle(tasks)
+    assert controller is not None
+    for episode in episodes(environment, controller, tasks):
+        assert len(episode) == environment.settings.horizon
+        assert not episode.terminated.any()
+
+
 def test_wind_oracle_and_blindness() -> None:
     environment, tasks = environment_of("point-robot-wind"), list(parameters_of("point-robot-wind"))
     knowing = environment.oracle(tasks)

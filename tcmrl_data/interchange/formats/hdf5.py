@@ -25,8 +25,8 @@ from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.formats._new_folder import new_folder, require_room_for
 from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
+from tcmrl_data.interchange.formats.new_folder import new_folder, require_room_for
 
 if TYPE_CHECKING:
     import h5py

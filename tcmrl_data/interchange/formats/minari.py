@@ -32,8 +32,8 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import MissingPackageError, StoreError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
-from tcmrl_data.interchange.formats._new_folder import new_folder, require_room_for
 from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
+from tcmrl_data.interchange.formats.new_folder import new_folder, require_room_for
 from tcmrl_data.store.manifest import TaskReferences
 
 if TYPE_CHECKING:
