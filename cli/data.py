@@ -13,6 +13,7 @@ from .frame import main_program, make_table, output_options, print_json, print_t
 from .inspection import inspect
 from .plugins import FORMAT
 from .progress import StageProgress
+from .show import show
 from .status import status
 from .verification import gc, import_policy, repair, verify
 
@@ -39,7 +40,7 @@ def data() -> None:
     """
 
 
-for _command in (plan, build, status, inspect, verify, repair, gc, import_policy, cache):
+for _command in (plan, build, status, show, inspect, verify, repair, gc, import_policy, cache):
     data.add_command(_command)
 
 

@@ -28,7 +28,8 @@ NUM_SEEDS = 10_000
 
 
 @click.command()
-@click.argument("name", metavar="FILE|NAME")
+@click.argument("name", metavar="FILE|NAME", required=False)
+@click.option("--list", "as_list", is_flag=True, help="List the experiments that come with the package.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
@@ -41,7 +42,7 @@ NUM_SEEDS = 10_000
     default=Path("data"),
     show_default=True,
     metavar="FOLDER",
-    help="Where the datasets lie, each in a folder named after its environment.",
+    help="Where the datasets lie, each in a folder named after its environment; or the one dataset.",
 )
 @click.option("--workers", type=click.IntRange(min=1), help="Runs at a time; one per core if left out.")
 @click.option("--steps", type=click.IntRange(min=1), help="Training steps of every run, schedules included.")
@@ -52,7 +53,8 @@ NUM_SEEDS = 10_000
 @click.option("--device", default="cpu", show_default=True, help="A torch device, such as cpu or cuda.")
 @output_options
 def experiment(
-    name: str,
+    name: str | None,
+    as_list: bool,
     out: Path | None,
     data: Path,
     workers: int | None,
@@ -65,22 +67,27 @@ def experiment(
 ) -> None:
     """Run an experiment: its methods on its environments under its seeds, several at once.
 
-    FILE is a TOML file; NAME is one that comes with the package, such as figure4_point_robot, figure5 or
-    figure10 (named after the paper's figures and tables). Everything is checked before the first run
-    starts. When the same command runs again, finished runs are kept and killed ones go on from their
-    last checkpoint, and end as if they had never stopped. The cores are shared out among the workers.
+    FILE is a TOML file; NAME is one that --list shows. Everything is checked before the first run starts.
+    When the same command runs again, finished runs are kept and killed ones go on from their last
+    checkpoint, and end as if they had never stopped. The cores are shared out among the workers.
 
     The folder holds one JSON document per run in runs/, and table.csv. Returns are undiscounted.
 
     \b
     Examples:
-      tcmrl experiment figure5
+      tcmrl experiment --list
+      tcmrl experiment tour --workers 2
       tcmrl experiment figure10 --workers 4 --seeds 0-2 --steps 1000 --out results/first-look
       tcmrl experiment mine.toml --data /disk/datasets --only TCMRL --only FOCAL
     """
     from tcmrl_algo import load_experiment, run_experiment
     from tcmrl_data import parse_indices
 
+    if as_list:
+        _print_list(as_json=as_json)
+        return
+    if name is None:
+        raise click.UsageError("Name a FILE or an experiment that `tcmrl experiment --list` shows.")
     loaded = load_experiment(name)
     out = out or Path("results") / loaded.name
     with stopped_by_signals(lambda: same_command(out)):
@@ -112,8 +119,24 @@ def experiment(
         fail_incomplete(f"{report.failed[0]}{more}; the same command tries again what failed")
 
 
+def _print_list(*, as_json: bool) -> None:
+    from tcmrl_algo import experiment_names, load_experiment
+
+    found = [load_experiment(name) for name in experiment_names()]
+    if as_json:
+        fields = {"name", "title", "source", "environments", "methods", "seeds", "protocols", "claims"}
+        print_json({"experiments": [one.model_dump(mode="json", include=fields) for one in found]})
+        return
+    table = make_table(
+        "Experiments", columns=["experiment", "asks", "runs"], text=["experiment"], long_text=["asks"]
+    )
+    for one in found:
+        table.add_row(one.name, one.title, str(len(one.environments) * len(one.methods) * len(one.seeds)))
+    print_table(table)
+
+
 def _line(event: "Finished") -> str:
-    left = f", about {duration(event.seconds_left)} left" if event.done < event.total else ""
+    left = f", about {duration(event.seconds_left)} left" if event.seconds_left else ""
     if event.result is None:
         return f"{event.done} of {event.total}: {event.id} failed: {event.error}{left}"
     result = event.result

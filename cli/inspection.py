@@ -12,11 +12,30 @@ from .frame import fail_incomplete, make_table, number, output_options, print_js
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
-@click.group()
+class _Inspections(click.Group):
+    """A group that says which of its commands a dataset may be given to."""
+
+    def resolve_command(
+        self, ctx: click.Context, args: list[str]
+    ) -> tuple[str | None, click.Command | None, list[str]]:
+        if self.get_command(ctx, args[0]) is None and Path(args[0]).exists():
+            choices = "|".join(self.commands)
+            raise click.UsageError(
+                f"Write `tcmrl-data inspect {choices} {args[0]}`, with one of these words."
+            )
+        return super().resolve_command(ctx, args)
+
+
+@click.group(cls=_Inspections)
 def inspect() -> None:
     """Look at a dataset: its returns, tasks, snapshots or episodes.
 
     DATASET is the dataset's folder or its manifest.json.
+
+    \b
+    Examples:
+      tcmrl-data inspect returns data/point-robot
+      tcmrl-data inspect episodes data/point-robot --task 7
     """
 
 

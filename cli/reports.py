@@ -17,8 +17,18 @@ from .progress import StageProgress
     metavar="FOLDER",
     help="Where the report is written; the folder `report` in the first of RUNS if left out.",
 )
+@click.option(
+    "--dataset",
+    "datasets",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    multiple=True,
+    help="A dataset that has moved since RUNS were trained on it; may be repeated.",
+)
 @output_options
-def report(runs: tuple[Path, ...], out: Path | None, as_json: bool, quiet: bool) -> None:
+def report(
+    runs: tuple[Path, ...], out: Path | None, datasets: tuple[Path, ...], as_json: bool, quiet: bool
+) -> None:
     """Write a report on RUNS: results folders of `tcmrl experiment`, or run folders of `tcmrl train`.
 
     report.md holds learning curves, final returns, what the contexts look like (t-SNE) and what the
@@ -32,6 +42,7 @@ def report(runs: tuple[Path, ...], out: Path | None, as_json: bool, quiet: bool)
       tcmrl report results/figure5
       tcmrl report results/figure5 results/figure10 --out docs/results/ablations
       tcmrl report runs/point-robot-tcmrl-seed0 --out report
+      tcmrl report results/figure5 --dataset /disk/point-robot
     """
     from tcmrl_algo import write_report
 
@@ -39,6 +50,7 @@ def report(runs: tuple[Path, ...], out: Path | None, as_json: bool, quiet: bool)
         written = write_report(
             runs,
             out or runs[0] / "report",
+            datasets=datasets,
             report=lambda stage, done, total: progress.update(stage, done=done, total=total, unit="parts"),
         )
     if as_json:

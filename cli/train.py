@@ -19,6 +19,7 @@ from .frame import (
 )
 from .progress import StageProgress
 from .reports import report
+from .runs import runs
 
 if TYPE_CHECKING:
     from tcmrl_algo import Progress, TrainingConfig, TrainingReport
@@ -52,6 +53,7 @@ def tcmrl() -> None:
 tcmrl.add_command(evaluate)
 tcmrl.add_command(experiment)
 tcmrl.add_command(report)
+tcmrl.add_command(runs)
 
 
 @tcmrl.command()
@@ -120,6 +122,10 @@ def train(
     from tcmrl_data import open_dataset, parse_bytes
 
     limit = parse_bytes(memory_limit) if memory_limit else None
+    if resume and not manifest.exists():
+        raise click.ClickException(
+            f"nothing lies at {manifest}; name the folder where the run's dataset lies now"
+        )
     dataset = open_dataset(manifest)
     config = _config(dataset, algo=algo, profile=profile, overrides=overrides)
     folder = out or Path("runs") / f"{dataset.name}-{config.settings.run.algorithm}-seed{seed or 0}"

@@ -17,6 +17,7 @@ from tcmrl_cli.data import data
 from tcmrl_data import Dataset
 from tests.commands import Call, assert_refused, in_process
 from tests.conftest import TASKS
+from tests.terminal import assert_fits, in_terminal
 
 Copy = Callable[[], Path]
 MAIN = "from tcmrl_cli.data import main; main()"
@@ -25,6 +26,38 @@ MAIN = "from tcmrl_cli.data import main; main()"
 @pytest.fixture
 def call(capsys: pytest.CaptureFixture[str]) -> Call:
     return in_process(data, capsys)
+
+
+def test_inspect_without_a_word_says_which_words_there_are(call: Call, tiny: Dataset) -> None:
+    expected = f"tcmrl-data inspect returns|tasks|snapshots|episodes {tiny.folder}"
+    assert_refused(call("inspect", tiny.folder), expected)
+    assert_refused(call("inspect", "retuns", tiny.folder), "retuns")
+
+
+def test_show_puts_a_dataset_on_one_screen(call: Call, tiny: Dataset) -> None:
+    document = json.loads(call("show", tiny.folder, "--json")[1])
+    counts = {key: document[key] for key in ("tasks", "train", "test", "parts", "parts_total", "episodes")}
+    assert counts == {"tasks": 5, "train": 4, "test": 1, "parts": 15, "parts_total": 15, "episodes": 90}
+    assert (document["steps"], document["snapshots"]) == (90 * 20, [0, 100, 150])
+    assert (document["root"], document["complete"]) == (tiny.manifest.root, True)
+    files = [file for part in tiny.folder.glob("tasks/*/snapshots/*") for file in part.rglob("*")]
+    stored = sum(file.stat().st_size for file in files if file.is_file() and file.name != "part.json")
+    assert document["bytes"] == stored
+    assert "torch" in document["made_with"]["packages"][0]
+    shown = in_terminal("tcmrl-data", "show", tiny.folder)
+    assert_fits(shown.output)
+    assert len(shown.output.splitlines()) < 40
+    assert "profile quick" in shown.output and "A point walks" in shown.output
+    assert "tcmrl train" in shown.errors
+
+
+def test_show_of_an_incomplete_dataset_says_what_goes_on(call: Call, tiny_copy: Copy) -> None:
+    folder = tiny_copy()
+    forget_parts(folder, task=40)
+    code, output, errors = call("show", folder)
+    assert code == 0
+    assert "12 of 15: incomplete" in output
+    assert "tcmrl-data build point-robot" in errors
 
 
 def test_inspect_returns_equals_sums_over_the_stored_rewards(call: Call, tiny: Dataset) -> None:

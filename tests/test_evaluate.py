@@ -273,11 +273,28 @@ def test_a_moved_dataset_is_found_by_path_and_checked_by_root(
     record = json.loads((copied / "run.json").read_text())
     record["dataset"] = str(tmp_path / "gone")
     (copied / "run.json").write_text(json.dumps(record))
+    with pytest.raises(CheckpointError, match=r"trained on .*gone, where nothing lies now.*--dataset"):
+        evaluate_run(copied)
     assert evaluate_run(copied, protocol="idaq", dataset_path=tiny_copy()) == expected
     record["root"] = "f" * 64
     (copied / "run.json").write_text(json.dumps(record))
     with pytest.raises(CheckpointError, match="root"):
         evaluate_run(copied, dataset_path=tiny_copy())
+
+
+def test_an_evaluation_becomes_points_of_the_runs_curves(trained: Path, tmp_path: Path) -> None:
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    copied = tmp_path / "run"
+    shutil.copytree(trained, copied)
+    (copied / "evaluations.jsonl").unlink(missing_ok=True)
+    evaluation = evaluate_run(copied, protocol="offline")
+    board = EventAccumulator(str(copied / "tensorboard")).Reload()
+    (point,) = board.Scalars("return/offline/final")
+    assert (point.step, point.value) == (20, pytest.approx(evaluation.mean_final))
+    assert "return/offline/shuffled" in board.Tags()["scalars"]
+    line = json.loads((copied / "evaluations.jsonl").read_text())
+    assert (line["step"], line["protocol"], line["final"]) == (20, "offline", evaluation.mean_final)
 
 
 def test_a_run_trained_on_another_device_is_evaluated_on_the_cpu(trained: Path, tmp_path: Path) -> None:

@@ -19,9 +19,9 @@ import tcmrl_data
 from tcmrl_algo import experiment_names, load_experiment, open_run, run_experiment, train_run
 from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.driver import Finished
-from tcmrl_algo.experiment.plan import resolve_method
+from tcmrl_algo.experiment.plan import plan_runs, resolve_method
 from tcmrl_algo.experiment.results import RunResult, read_results
-from tcmrl_data import TcmrlError, TrainingError
+from tcmrl_data import SelectionError, TcmrlError, TrainingError
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
@@ -219,10 +219,29 @@ def test_a_bad_file_is_refused_before_anything_starts(
 
 
 def test_unknown_names_and_broken_files_are_refused(tmp_path: Path, call: Call) -> None:
-    assert_refused(call("experiment", "figure55"), "figure55", "figure5")
+    assert_refused(call("experiment", "figur5"), "figur5", "did you mean figure5")
+    assert_refused(call("experiment"), "--list")
     assert_refused(call("experiment", tmp_path / "none.toml"), "none.toml")
     (tmp_path / "broken.toml").write_text("name = ")
     assert_refused(call("experiment", tmp_path / "broken.toml"), "no TOML")
+
+
+def test_the_list_of_experiments_says_what_each_asks(call: Call) -> None:
+    rows = json.loads(call("experiment", "--list", "--json")[1])["experiments"]
+    assert [row["name"] for row in rows] == experiment_names()
+    assert all(row["title"] and row["methods"] and row["seeds"] for row in rows)
+    shown = in_terminal("tcmrl", "experiment", "--list")
+    assert_fits(shown.output)
+    assert all(name in shown.output for name in experiment_names())
+
+
+def test_data_may_name_the_one_dataset_itself(tiny_folder: Path, tmp_path: Path) -> None:
+    tour = load_experiment("tour")
+    with pytest.raises(SelectionError, match=r"--profile quick --out data/demo.*--data"):
+        plan_runs(tour, data=tmp_path)
+    runs = plan_runs(tour, data=tiny_folder)
+    assert {run.dataset for run in runs} == {tiny_folder.resolve()}
+    assert len(runs) == 10
 
 
 @pytest.mark.parametrize("name", experiment_names())

@@ -120,6 +120,8 @@ def test_resuming_takes_the_settings_of_the_run_and_no_others(
     train_run(tiny, folder, config=config_of(tiny), profile="quick", steps=5)
     again = ("train", tiny_folder, "--out", folder, "--steps", 10)
     assert_refused(call(*again), "--resume")
+    gone = ("train", tmp_path / "gone", "--resume", "--out", folder)
+    assert_refused(call(*gone), "gone", "where the run's dataset lies now")
     refused = call(*again, "--resume", "--set", SMALL[0], "--set", "tcmrl.latent=5")
     assert_refused(refused, "tcmrl.latent=5", "leave it out")
     assert_refused(call(*again, "--resume", "--profile", "paper"), "--profile quick")

@@ -5,6 +5,7 @@ import json
 import math
 import re
 import shutil
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -321,3 +322,23 @@ def test_runs_of_one_algorithm_with_other_settings_are_told_apart(results: Path,
     torch.testing.assert_close(
         open_run(first).newest().tensors(), open_run(other).newest().tensors(), rtol=0, atol=0
     )
+
+
+def test_a_moved_dataset_is_named_with_an_option(
+    results: Path, tiny_copy: Callable[[], Path], tmp_path: Path, call: Call
+) -> None:
+    copied, moved = tmp_path / "results", tiny_copy()
+    shutil.copytree(results, copied)
+    for file in copied.glob("runs/*.json"):
+        file.write_text(json.dumps(json.loads(file.read_text()) | {"dataset": str(tmp_path / "gone")}))
+    assert call("report", copied, "--quiet")[0] == 0
+    assert "gone now; name the dataset's new place" in (copied / "report/report.md").read_text()
+    assert call("report", copied, "--dataset", moved, "--quiet")[0] == 0
+    assert "are left out" not in (copied / "report/report.md").read_text()
+    other = tmp_path / "other"
+    (other / "runs").mkdir(parents=True)
+    shutil.copy(copied / "experiment.json", other)
+    for file in copied.glob("runs/*.json"):
+        document = json.loads(file.read_text()) | {"root": "0" * 64}
+        (other / "runs" / file.name).write_text(json.dumps(document))
+    assert_refused(call("report", other, "--dataset", moved), str(moved), "no run")

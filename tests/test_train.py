@@ -358,6 +358,26 @@ def test_train_command_refuses_bad_input_in_one_line(tiny_folder: Path, tmp_path
     assert not (tmp_path / "run").exists()
 
 
+def test_the_list_of_runs_says_how_far_they_are(start: Train, tmp_path: Path, call: Call) -> None:
+    assert json.loads(call("runs", tmp_path, "--json")[1]) == {"runs": []}
+    folder = start("first", steps=10, seed=3).run.folder
+    lines = [
+        '{"step": 5, "protocol": "paper", "final": 1.0}',
+        '{"step": 10, "protocol": "idaq", "final": -2.5}',
+    ]
+    (folder / "evaluations.jsonl").write_text("\n".join([*lines, '{"st']))
+    (tmp_path / "second").mkdir()
+    (tmp_path / "second/run.json").write_text("{")
+    first, second = json.loads(call("runs", tmp_path, "--json")[1])["runs"]
+    assert (first["path"], first["algorithm"], first["seed"]) == (str(folder), "tcmrl", 3)
+    assert (first["step"], first["steps"], first["evaluation"]["final"]) == (10, 10, -2.5)
+    assert "run.json" in second["error"]
+    output = call("runs", tmp_path)[1]
+    assert "tcmrl on point-robot, seed 3" in output and "10/10" in output and "idaq -2.50" in output
+    assert first["root"][:12] in output
+    assert_refused(call("runs", tmp_path / "nothing"), "nothing", "is no folder")
+
+
 def test_resume_refuses_another_seed(start: Train, tiny_folder: Path, call: Call) -> None:
     folder = start("run", steps=10, seed=1).run.folder
     result = call("train", tiny_folder, "--resume", "--seed", 2, "--out", folder)

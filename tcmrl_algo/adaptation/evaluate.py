@@ -14,8 +14,9 @@ from tcmrl_algo.adaptation.arena import Arena, Context, ProgressCallback, ignore
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS, Adaptation
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_algo.training.checkpoint import Run, open_run
+from tcmrl_algo.training.metrics import log_evaluation
 from tcmrl_algo.training.train import create_algorithm
-from tcmrl_data import Dataset, Task, TrainingError, Trajectory, open_dataset
+from tcmrl_data import Dataset, Task, TrainingError, Trajectory
 
 MOST_OTHERS = 3
 """Other tasks whose contexts are tried on a task; one alone could lie too near or far."""
@@ -79,7 +80,7 @@ def evaluate_run(
     episodes: int | None = None,
     report: ProgressCallback = ignore_progress,
 ) -> Evaluation:
-    """Evaluates the newest checkpoint of a run.
+    """Evaluates the newest checkpoint of a run, and logs the means in the run's folder.
 
     Args:
         run_folder: made by `train`.
@@ -98,13 +99,20 @@ def evaluate_run(
         >>> evaluation.mean_final, evaluation.mean_shuffled  # doctest: +SKIP
     """
     run = open_run(run_folder)
-    dataset = open_dataset(dataset_path or run.record.dataset)
-    run.check_dataset(dataset)
+    dataset = run.open_dataset(dataset_path)
     settings = run.record.config.settings.run
     changes = {"protocol": protocol, "episodes": episodes}
     settings = settings.model_copy(update={key: each for key, each in changes.items() if each is not None})
     torch.set_num_threads(settings.threads)
-    return evaluate_open_run(run, dataset, settings, report=report)
+    evaluation = evaluate_open_run(run, dataset, settings, report=report)
+    scores = {
+        "final": evaluation.mean_final,
+        "shuffled": evaluation.mean_shuffled,
+        "regret": evaluation.mean_regret,
+        "normalized": evaluation.mean_normalized,
+    }
+    log_evaluation(run.folder, step=run.newest().step, protocol=evaluation.protocol, scores=scores)
+    return evaluation
 
 
 def evaluate_open_run(

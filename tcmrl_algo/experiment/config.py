@@ -12,6 +12,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data import TrainingError
+from tcmrl_data.foundation.plugins import unknown_name
 from tcmrl_data.foundation.validation import validate_table
 
 Metric = Literal[
@@ -135,20 +136,24 @@ def load_experiment(name: str | Path) -> Experiment:
     """An experiment from a TOML file, or by the name of one that comes with the package.
 
     Raises:
-        TrainingError: no such file or name, no TOML, an unknown key, a wrong type or a contradiction.
+        UnknownNameError: no experiment has such a name; says the nearest names.
+        TrainingError: no such file, no TOML, an unknown key, a wrong type or a contradiction.
 
     Example:
         >>> load_experiment("figure5").source
         'Figure 5'
     """
     file: Path | Traversable = Path(name)
-    if Path(name).suffix != ".toml" and re.fullmatch(r"[a-z0-9_-]+", str(name)):
+    if Path(name).suffix != ".toml":
+        if name not in experiment_names():
+            raise unknown_name("experiment", str(name), experiment_names())
         file = _shipped() / f"{name}.toml"
     try:
         tables = tomllib.loads(file.read_text(encoding="utf-8"))
     except (FileNotFoundError, IsADirectoryError):
-        known = ", ".join(experiment_names())
-        raise TrainingError(f"no experiment {str(name)!r}: neither a TOML file nor one of {known}") from None
+        raise TrainingError(
+            f"no experiment file {name}; name a TOML file, or one that `tcmrl experiment --list` shows"
+        ) from None
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise TrainingError(f"{name} is no TOML file: {error}") from None
     return read_experiment(tables, place=f"experiment {str(name)!r}")

@@ -30,7 +30,7 @@ class Finished:
         result: what it left; None where it failed.
         error: why, where it failed.
         done, total: runs ended by now, and all runs of the experiment.
-        seconds_left: until all are, if the rest goes at the pace so far.
+        seconds_left: until all are, if the rest goes at the pace so far; None until every worker ended a run.
     """
 
     id: str
@@ -38,7 +38,7 @@ class Finished:
     error: str | None
     done: int
     total: int
-    seconds_left: float
+    seconds_left: float | None
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def run_experiment(
     Args:
         experiment: what to run.
         out: the results folder; a second call goes on in it.
-        data: folder of datasets, one per environment.
+        data: folder of datasets, one per environment; or one dataset.
         only: labels of methods; all where empty.
         seeds: instead of the experiment's.
         steps: training steps instead of `run.steps`.
@@ -130,7 +130,9 @@ def run_experiment(
             _write_table(out, experiment)
             ended = sum(each is not None for each in found.values()) + len(failed)
             pace = (time.perf_counter() - began) / (ended - present)
-            report(Finished(name, result, error, ended, len(plan), pace * (len(plan) - ended)))
+            is_known = ended - present >= min(workers, len(jobs))
+            left = pace * (len(plan) - ended) if is_known else None
+            report(Finished(name, result, error, ended, len(plan), left))
     results = tuple(each for each in found.values() if each is not None)
     return ExperimentReport(out, results, present, tuple(failed), time.perf_counter() - began)
 

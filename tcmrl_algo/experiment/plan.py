@@ -59,7 +59,7 @@ def plan_runs(
 
     Args:
         experiment: the file.
-        data: folder of datasets, one per environment.
+        data: folder of datasets, one per environment; or one dataset, whatever the file says of its place.
         seeds: instead of the experiment's.
         steps: training steps instead of `run.steps`, of runs and schedules.
 
@@ -118,6 +118,8 @@ def _check_protocols(experiment: Experiment) -> None:
 
 def _dataset(environment: str, choice: EnvironmentChoice, data: Path) -> Dataset:
     folder = Path(choice.dataset) if choice.dataset else data / environment
+    if (data / "manifest.json").is_file():
+        folder = data
     if not (folder / "manifest.json").is_file():
         profile = f" --profile {choice.profile}" if choice.profile else ""
         raise SelectionError(

@@ -13,7 +13,7 @@ from tcmrl_algo.context_methods.learner import ContextAlgorithm
 from tcmrl_algo.reporting.sources import FinishedRun
 from tcmrl_algo.training.checkpoint import open_run
 from tcmrl_algo.training.train import create_algorithm
-from tcmrl_data import Dataset, Task, Trajectory, open_dataset
+from tcmrl_data import CheckpointError, Dataset, Task, Trajectory, open_dataset
 
 NUM_TASKS = 20
 """As many tasks as in the paper's t-SNE figures (Appendix G.7)."""
@@ -156,6 +156,8 @@ class Trained:
         """
         place, settings = run.result.dataset, run.result.config.settings.run
         snapshots = settings.context_snapshots or settings.snapshots
+        if not Path(place).exists():
+            raise CheckpointError(f"nothing lies at {place} now; name the dataset's new place with --dataset")
         if (place, snapshots) not in self._stored:
             self._stored[place, snapshots] = Stored(open_dataset(place), snapshots)
         return self._stored[place, snapshots]

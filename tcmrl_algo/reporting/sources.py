@@ -1,7 +1,7 @@
 """What a report is on: results folders as experiments left them, and single runs gathered into one."""
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.experiment.config import Experiment, read_experiment, run_id
 from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file
 from tcmrl_algo.training.checkpoint import Run, digest, open_run
-from tcmrl_data import CheckpointError, TrainingError, canonical_json, parse_json
+from tcmrl_data import CheckpointError, TrainingError, canonical_json, open_dataset, parse_json
 
 
 @dataclass(frozen=True)
@@ -49,16 +49,24 @@ class Source:
         return [each for each in self.runs if each.result.environment == environment]
 
 
-def read_sources(paths: Sequence[Path], report: Callable[[str, int, int], None]) -> list[Source]:
+def read_sources(
+    paths: Sequence[Path], report: Callable[[str, int, int], None], *, datasets: Sequence[Path] = ()
+) -> list[Source]:
     """Results folders in the order given, then one source of all run folders, which are evaluated here.
 
+    Args:
+        paths: the folders.
+        report: called as run folders are evaluated.
+        datasets: folders of datasets that have moved since the runs were trained on them.
+
     Raises:
-        CheckpointError: neither kind of folder, or no finished run in it.
+        CheckpointError: neither kind of folder, no finished run in it, or a dataset of none of the runs.
     """
+    places = {open_dataset(folder).manifest.root: str(folder.resolve()) for folder in datasets}
     sources, runs = [], []
     for path in paths:
         if (path / "experiment.json").is_file():
-            sources.append(_results_folder(path))
+            sources.append(_results_folder(path, places))
         elif (path / "run.json").is_file():
             runs.append(open_run(path))
         else:
@@ -67,11 +75,22 @@ def read_sources(paths: Sequence[Path], report: Callable[[str, int, int], None])
                 "`tcmrl train` made"
             )
     if runs:
-        sources.append(_single_runs(runs, report))
+        sources.append(_single_runs(runs, report, places))
+    used = {run.result.root for source in sources for run in source.runs}
+    for root, place in places.items():
+        if root not in used:
+            raise CheckpointError(
+                f"--dataset {place} has root {root[:12]}, which no run was trained on; leave it out"
+            )
     return sources
 
 
-def _results_folder(path: Path) -> Source:
+def _at_home(result: RunResult, places: Mapping[str, str]) -> RunResult:
+    """A result that says where its dataset lies now."""
+    return result.model_copy(update={"dataset": places.get(result.root, result.dataset)})
+
+
+def _results_folder(path: Path, places: Mapping[str, str]) -> Source:
     file = path / "experiment.json"
     try:
         tables = parse_json(file.read_bytes())
@@ -81,8 +100,10 @@ def _results_folder(path: Path) -> Source:
         raise TrainingError(f"{file} is no experiment; run `tcmrl experiment` again, which writes it")
     experiment = read_experiment(tables, place=str(file))
     found = [
-        FinishedRun(each, path / "runs" / run_id(each.environment, each.method, each.seed))
-        for each in read_results(path, experiment)
+        FinishedRun(
+            _at_home(result, places), path / "runs" / run_id(result.environment, result.method, result.seed)
+        )
+        for result in read_results(path, experiment)
     ]
     if not found:
         raise CheckpointError(f"{path} holds no finished run yet; `tcmrl experiment` goes on with them")
@@ -102,7 +123,9 @@ def _missing(path: Path, experiment: Experiment) -> tuple[str, ...]:
     return tuple(found)
 
 
-def _single_runs(runs: Sequence[Run], report: Callable[[str, int, int], None]) -> Source:
+def _single_runs(
+    runs: Sequence[Run], report: Callable[[str, int, int], None], places: Mapping[str, str]
+) -> Source:
     """Runs as if an experiment had made them; those of one algorithm count as seeds of one method."""
     labels = labels_of(runs)
     experiment = read_experiment(
@@ -123,7 +146,7 @@ def _single_runs(runs: Sequence[Run], report: Callable[[str, int, int], None]) -
     found = []
     for done, (label, run) in enumerate(zip(labels, runs, strict=True)):
         report("evaluating", done, len(runs))
-        found.append(FinishedRun(_evaluated(label, run), run.folder))
+        found.append(FinishedRun(_evaluated(label, run, places.get(run.record.root)), run.folder))
     report("evaluating", len(runs), len(runs))
     order = list(experiment.methods)
     key = [(each.result.environment, order.index(each.result.method), each.result.seed) for each in found]
@@ -153,9 +176,12 @@ def _are_seeds(runs: Sequence[Run]) -> bool:
     return len(kinds) == 1 and len({run.record.seed for run in runs}) == len(runs)
 
 
-def _evaluated(label: str, run: Run) -> RunResult:
+def _evaluated(label: str, run: Run, place: str | None) -> RunResult:
     record = run.record
-    documents = {name: evaluate_run(run.folder, protocol=name).to_json() for name in PROTOCOLS.working()}
+    documents = {
+        name: evaluate_run(run.folder, protocol=name, dataset_path=place).to_json()
+        for name in PROTOCOLS.working()
+    }
     return RunResult(
         experiment="runs",
         method=label,
@@ -163,7 +189,7 @@ def _evaluated(label: str, run: Run) -> RunResult:
         environment=record.environment,
         seed=record.seed,
         profile=record.profile,
-        dataset=record.dataset,
+        dataset=place or record.dataset,
         root=record.root,
         steps=run.newest().step,
         device=record.device,

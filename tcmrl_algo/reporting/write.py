@@ -96,21 +96,30 @@ def ignore(stage: str, done: int, total: int) -> None:
     """Reports nothing."""
 
 
-def write_report(paths: Sequence[str | Path], out: str | Path, *, report: Progress = ignore) -> Report:
+def write_report(
+    paths: Sequence[str | Path],
+    out: str | Path,
+    *,
+    datasets: Sequence[str | Path] = (),
+    report: Progress = ignore,
+) -> Report:
     """Writes a report on results folders of experiments, and on run folders.
 
     Args:
         paths: the folders; all run folders together make one section.
         out: folder of the report, made here; files of an earlier report are replaced.
+        datasets: folders of datasets that have moved since the runs were trained on them.
         report: called with a stage, and how much of it is done and to do.
 
     Raises:
-        CheckpointError: a folder is of neither kind, or holds nothing finished.
+        CheckpointError: a folder is of neither kind or holds nothing finished, or a dataset is of no run.
 
     Example:
         >>> write_report(["results/figure5"], "docs/results/figure5").verdicts  # doctest: +SKIP
     """
-    sources = read_sources([Path(each) for each in paths], report)
+    sources = read_sources(
+        [Path(path) for path in paths], report, datasets=[Path(folder) for folder in datasets]
+    )
     head, page, trained = Page(Path(out)), Page(Path(out)), Trained()
     page.out.mkdir(parents=True, exist_ok=True)
     head.text("# Report")

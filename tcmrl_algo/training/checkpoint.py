@@ -13,7 +13,7 @@ from torch import Tensor
 
 from tcmrl_algo.methods.problem import MomentsRecord
 from tcmrl_algo.training.config import TrainingConfig
-from tcmrl_data import CheckpointError, Dataset
+from tcmrl_data import CheckpointError, Dataset, open_dataset
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import make_folders, publish_folder, remove_abandoned, remove_tree
 from tcmrl_data.foundation.records import read_record, record_bytes, write_record
@@ -138,6 +138,24 @@ class Run:
         remove_abandoned(self.folder)  # by a run that was killed while it saved
         for checkpoint in self.checkpoints()[:-KEPT]:
             remove_tree(checkpoint.folder)
+
+    def open_dataset(self, path: str | Path | None = None) -> Dataset:
+        """The dataset that it was trained on.
+
+        Args:
+            path: where it lies now, if it has moved.
+
+        Raises:
+            CheckpointError: it is not where it was, or the path holds another one.
+        """
+        if path is None and not Path(self.record.dataset).exists():
+            raise CheckpointError(
+                f"the run in {self.folder} was trained on {self.record.dataset}, where nothing lies now; "
+                "name the dataset's new place with --dataset"
+            )
+        dataset = open_dataset(path or self.record.dataset)
+        self.check_dataset(dataset)
+        return dataset
 
     def check_dataset(self, dataset: Dataset) -> None:
         """Refuses data that the run was not trained on.

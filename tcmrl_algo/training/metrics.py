@@ -1,5 +1,6 @@
-"""Metrics as they come, in one place: a line of JSON and a TensorBoard point per logged step."""
+"""Metrics and evaluations as they come, in one place: a line of JSON and TensorBoard points."""
 
+import contextlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -7,6 +8,28 @@ from types import TracebackType
 from typing import final
 
 from torch.utils.tensorboard import SummaryWriter
+
+EVALUATIONS = "evaluations.jsonl"
+
+
+def log_evaluation(folder: Path, *, step: int, protocol: str, scores: Mapping[str, float | None]) -> None:
+    """Appends mean scores of an evaluation to a run's `evaluations.jsonl`, and to its TensorBoard curves.
+
+    A run that cannot be written to, such as one on a shared disk, is evaluated all the same.
+
+    Args:
+        folder: the run's.
+        step: of the checkpoint that was evaluated.
+        protocol: by which it was adapted.
+        scores: by name; None where there is none.
+    """
+    with contextlib.suppress(OSError):
+        with (folder / EVALUATIONS).open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps({"step": step, "protocol": protocol, **scores}) + "\n")
+        with SummaryWriter(str(folder / "tensorboard"), filename_suffix=f".{protocol}") as board:
+            for name, value in scores.items():
+                if value is not None:
+                    board.add_scalar(f"return/{protocol}/{name}", value, step)
 
 
 @final

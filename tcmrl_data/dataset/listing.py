@@ -5,7 +5,7 @@ from typing import Any
 
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.store.manifest import MANIFEST, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, Manifest, read_manifest
 
 
 def list_datasets(root: str | Path) -> list[dict[str, Any]]:
@@ -19,17 +19,20 @@ def list_datasets(root: str | Path) -> list[dict[str, Any]]:
         except ManifestError as error:
             rows.append({"path": str(file.parent), "error": str(error)})
             continue
-        rows.append(
-            {
-                "path": str(file.parent),
-                "name": manifest.name,
-                "profile": manifest.profile,
-                "behavior": manifest.recipe.behavior["source"],
-                "seed": manifest.seed,
-                "tasks": len(manifest.tasks),
-                "parts": len(manifest.parts),
-                "complete": manifest.complete,
-                "root": manifest.root,
-            }
-        )
+        rows.append(dataset_row(manifest, file.parent))
     return rows
+
+
+def dataset_row(manifest: Manifest, folder: Path) -> dict[str, Any]:
+    """What a dataset's manifest says in short."""
+    return {
+        "path": str(folder),
+        "name": manifest.name,
+        "profile": manifest.profile,
+        "behavior": manifest.recipe.behavior["source"],
+        "seed": manifest.seed,
+        "tasks": len(manifest.tasks),
+        "parts": len(manifest.parts),
+        "complete": manifest.complete,
+        "root": manifest.root,
+    }

@@ -1,0 +1,55 @@
+"""`tcmrl runs`: which runs there are, and how far they are."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .frame import make_table, number, output_options, print_json, print_table, remark
+
+
+@click.command()
+@click.argument("root", type=click.Path(path_type=Path), required=False)
+@output_options
+def runs(root: Path | None, as_json: bool, quiet: bool) -> None:
+    """List the runs below ROOT (runs if left out), with their last evaluation.
+
+    \b
+    Examples:
+      tcmrl runs
+      tcmrl runs results/figure5 --json
+    """
+    from tcmrl_algo.training.listing import list_runs
+
+    if root is not None and not root.is_dir():
+        raise click.ClickException(f"{root} is no folder; name one that holds runs")
+    root = root or Path("runs")
+    rows = list_runs(root)
+    if as_json:
+        print_json({"runs": rows})
+        return
+    if not rows:
+        remark(f"no runs below {root}; make one with `tcmrl train DATASET`", quiet=quiet)
+        return
+    table = make_table(
+        f"Runs below {root}",
+        columns=["run", "trained", "steps", "dataset", "last return"],
+        text=["dataset"],
+        long_text=["run", "trained"],
+    )
+    for row in rows:
+        table.add_row(*_cells(row))
+    print_table(table)
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    if "error" in row:
+        return row["path"], f"unreadable: {row['error']}", "", "", ""
+    evaluation = row["evaluation"]
+    return (
+        row["path"],
+        f"{row['algorithm']} on {row['environment']}, seed {row['seed']}",
+        f"{row['step']:,}/{row['steps']:,}",
+        row["root"][:12],
+        f"{evaluation['protocol']} {number(evaluation['final'])}" if evaluation else "–",
+    )

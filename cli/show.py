@@ -1,0 +1,64 @@
+"""`tcmrl-data show`: a dataset on one screen, and what can be done with it."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.sizes import size
+
+from .frame import make_table, output_options, print_json, print_table, remark
+
+
+@click.command()
+@click.argument("dataset", type=click.Path(path_type=Path))
+@output_options
+def show(dataset: Path, as_json: bool, quiet: bool) -> None:
+    """Show on one screen what DATASET is: recipe, tasks, sizes, root, and with what it was made.
+
+    \b
+    Examples:
+      tcmrl-data show data/point-robot
+      tcmrl-data show data/point-robot --json
+    """
+    import tcmrl_data
+    from tcmrl_data.dataset.summary import dataset_summary
+
+    opened = tcmrl_data.open_dataset(dataset)
+    document = dataset_summary(opened)
+    if as_json:
+        print_json(document)
+        return
+    title = printable(str(opened.folder))
+    table = make_table(title, columns=["what", "value"], text=["what"], long_text=["value"])
+    for name, value in _rows(document).items():
+        table.add_row(name, printable(value))
+    print_table(table)
+    for command in _next_commands(opened.folder, document):
+        remark(f"Next: {command}", quiet=quiet)
+
+
+def _rows(document: dict[str, Any]) -> dict[str, str]:
+    made, steps = document["made_with"], document["snapshots"]
+    state = "complete" if document["complete"] else "incomplete"
+    rows = {
+        "environment": f"{document['name']}: {document['description']}",
+        "recipe": f"profile {document['profile']}, behavior {document['behavior']}, seed {document['seed']}",
+        "tasks": f"{document['tasks']:,} ({document['train']:,} train, {document['test']:,} test)",
+        "snapshots": f"{len(steps):,} per task, at steps {', '.join(f'{step:,}' for step in steps)}",
+        "parts": f"{document['parts']:,} of {document['parts_total']:,}: {state}",
+        "episodes": f"{document['episodes']:,} with {document['steps']:,} steps",
+        "size": size(document["bytes"]),
+        "root": document["root"],
+    }
+    if made["created"]:
+        rows["made"] = " to ".join(dict.fromkeys((made["created"][0], made["created"][-1])))
+    labels = {"cpu": "on", "platform": "under", "packages": "with"}
+    return rows | {label: "; ".join(made[key]) for key, label in labels.items() if made[key]}
+
+
+def _next_commands(folder: Path, document: dict[str, Any]) -> list[str]:
+    if not document["complete"]:
+        return [f"the `tcmrl-data build {document['name']}` command that began it goes on"]
+    return [f"tcmrl-data inspect returns {folder}", f"tcmrl-data verify {folder}", f"tcmrl train {folder}"]
