@@ -65,7 +65,7 @@ def recipe_options(command: Command) -> Command:
             default="local",
             show_default=True,
             type=ENGINE,
-            help="Where the work runs; ray needs tcmrl[ray].",
+            help="Where the work runs.",
         ),
         output_options,
     )

@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcmrl_data.foundation.plugins import declared_names
-
 from .frame import make_table, number, output_options, print_json, print_table, remark
+from .plugins import ALL_PROTOCOLS, PROTOCOL
 from .progress import StageProgress
 
 if TYPE_CHECKING:
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
 
     from tcmrl_algo import Evaluation, TaskResult
 
-ALL = "all"
 OTHER = "other: the same policy under other tasks' contexts"
 SCORES = {
     "regret": "regret: oracle - adapted",
@@ -76,9 +74,8 @@ def _mean(values: Sequence[float | None]) -> float | None:
 @click.argument("run_folder", metavar="RUN", type=click.Path(path_type=Path))
 @click.option(
     "--protocol",
-    metavar="NAME",
-    help=f"How to adapt: {', '.join(declared_names('tcmrl.protocols'))}, or {ALL} to compare them; "
-    "the recipe's choice if left out.",
+    type=PROTOCOL,
+    help="How to adapt; the recipe's choice if left out. `all` runs every protocol and compares them.",
 )
 @click.option(
     "--dataset",
@@ -113,7 +110,7 @@ def evaluate(
 
     with StageProgress(quiet=quiet) as progress:
         results = []
-        for name in _protocols(progress) if protocol == ALL else [protocol]:
+        for name in _protocols(progress) if protocol == ALL_PROTOCOLS else [protocol]:
 
             def show(stage: str, done: int, total: int, name: str | None = name) -> None:
                 label = f"{name} {stage}" if name else stage
@@ -124,7 +121,7 @@ def evaluate(
             )
     if as_json:
         documents = [result.to_json() for result in results]
-        print_json(documents if protocol == ALL else documents[0])
+        print_json(documents if protocol == ALL_PROTOCOLS else documents[0])
         return
     for table in score_tables(results):
         print_table(table)

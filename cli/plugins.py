@@ -1,5 +1,6 @@
 """Options that take the name of a plug-in."""
 
+from collections.abc import Sequence
 from typing import Any, final
 
 import click
@@ -14,27 +15,34 @@ class PluginName(click.ParamType):  # type: ignore[type-arg] # generic in newer 
     Args:
         group: the entry point group, such as `tcmrl.engines`.
         noun: what an error message calls a plug-in of this group.
+        others: further words that the option takes.
     """
 
     name = "name"
 
-    def __init__(self, group: str, noun: str) -> None:
-        self._group, self._noun = group, noun
+    def __init__(self, group: str, noun: str, *, others: Sequence[str] = ()) -> None:
+        self._group, self._noun, self._others = group, noun, others
 
     def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
-        from tcmrl_data.foundation.plugins import declared_names
-
-        return f"[{'|'.join(declared_names(self._group))}]"
+        return f"[{'|'.join(self._known())}]"
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
-        from tcmrl_data.foundation.plugins import declared_names, unknown_name
+        from tcmrl_data.foundation.plugins import unknown_name
 
-        known = declared_names(self._group)
-        if value not in known:
-            raise unknown_name(self._noun, value, known)
+        if value not in self._known():
+            raise unknown_name(self._noun, value, self._known())
         return str(value)
+
+    def _known(self) -> list[str]:
+        from tcmrl_data.foundation.plugins import declared_names
+
+        return [*declared_names(self._group), *self._others]
+
+
+ALL_PROTOCOLS = "all"
 
 
 BEHAVIOR = PluginName("tcmrl.behavior", "behavior source")
 ENGINE = PluginName("tcmrl.engines", "engine")
+PROTOCOL = PluginName("tcmrl.protocols", "protocol", others=[ALL_PROTOCOLS])
 FORMAT = PluginName("tcmrl.formats", "format")
