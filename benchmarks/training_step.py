@@ -21,11 +21,12 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from tcmrl_algo import ContextAlgorithm
+from tcmrl_algo.methods.base import METHODS
 from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.stages import StagePlan
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_algo.training.config import ALGORITHMS
 from tcmrl_algo.training.memory import keep_freed_memory
-from tcmrl_data import Batch, Steps, plugin
+from tcmrl_data import Batch, Steps
 
 PEAK_SIZE = 1024
 
@@ -94,6 +95,10 @@ def made_up(sizes: Sizes, algorithm: str, precision: str) -> tuple[ContextAlgori
         moving = draw(*lead, observation), draw(*lead, action).tanh(), draw(*lead), draw(*lead, observation)
         return Steps(*moving, torch.zeros(lead), mask)
 
+    batch = {"tasks": sizes.tasks, "transitions": sizes.transitions, "window_length": 4}
+    settings = TrainingSettings.model_validate({"batch": batch, "run": {"precision": precision}})
+    method = METHODS.get(algorithm)()
+    config = method.Config()
     problem = Problem(
         environment="made-up",
         observation_dim=observation,
@@ -110,13 +115,12 @@ def made_up(sizes: Sizes, algorithm: str, precision: str) -> tuple[ContextAlgori
         reward_std=1.0,
         reward_range=(-1.0, 1.0),
         seed=0,
-        steps=1000,
+        stages=StagePlan(method.stages(settings, config), steps=settings.run.steps),
+        training_tasks=tuple(range(sizes.tasks)),
+        privileged=None,
         device=torch.device("cpu"),
     )
-    batch = {"tasks": sizes.tasks, "transitions": sizes.transitions, "window_length": 4}
-    settings = TrainingSettings.model_validate({"batch": batch, "run": {"precision": precision}})
-    module = plugin(ALGORITHMS, "algorithm", algorithm)
-    made = module.create(problem, settings, module.Config())
+    made = method.create(problem, settings, config)
     assert isinstance(made, ContextAlgorithm)
     kinds = {
         "policy": steps(sizes.transitions),

@@ -6,6 +6,9 @@ from .adaptation.protocols.base import PROTOCOLS as PROTOCOLS
 from .adaptation.protocols.base import Adaptation as Adaptation
 from .adaptation.protocols.base import Protocol as Protocol
 from .context_methods.learner import ContextAlgorithm as ContextAlgorithm
+from .context_methods.learner import ContextLearner as ContextLearner
+from .context_methods.learner import ContextLosses as ContextLosses
+from .context_methods.packing import pack as pack
 from .experiment.aggregate import Summary as Summary
 from .experiment.aggregate import summarize as summarize
 from .experiment.config import Experiment as Experiment
@@ -15,8 +18,16 @@ from .experiment.driver import ExperimentReport as ExperimentReport
 from .experiment.driver import Finished as Finished
 from .experiment.driver import run_experiment as run_experiment
 from .experiment.results import RunResult as RunResult
-from .methods.problem import Algorithm as Algorithm
+from .methods.base import METHODS as METHODS
+from .methods.base import Algorithm as Algorithm
+from .methods.base import Capabilities as Capabilities
+from .methods.base import Method as Method
+from .methods.base import Metrics as Metrics
 from .methods.problem import Problem as Problem
+from .methods.stages import Stage as Stage
+from .methods.stages import StagedOptimizer as StagedOptimizer
+from .methods.stages import StagePlan as StagePlan
+from .methods.state import TrainedModules as TrainedModules
 from .reporting.write import Report as Report
 from .reporting.write import write_report as write_report
 from .settings.training import TrainingSettings as TrainingSettings
@@ -25,6 +36,7 @@ from .training.checkpoint import RunRecord as RunRecord
 from .training.checkpoint import open_run as open_run
 from .training.config import TrainingConfig as TrainingConfig
 from .training.config import resolve as resolve
+from .training.config import resolve_for as resolve_for
 from .training.train import Progress as Progress
 from .training.train import TrainingReport as TrainingReport
 from .training.train import create_algorithm as create_algorithm

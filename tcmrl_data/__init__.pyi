@@ -40,6 +40,7 @@ from .foundation.sizes import parse_bytes as parse_bytes
 from .interchange.formats.base import FORMATS as FORMATS
 from .recipe.listing import list_environments as list_environments
 from .recipe.recipe import PROFILES as PROFILES
+from .recipe.recipe import Profile as Profile
 from .recipe.recipe import Recipe as Recipe
 from .recipe.recipe import apply_overrides as apply_overrides
 from .recipe.recipe import load_recipe as load_recipe

@@ -1,6 +1,7 @@
 """Shared fixtures: one real, tiny dataset, built once per session with the real libraries."""
 
 import shutil
+import sys
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -13,6 +14,8 @@ import tcmrl_data
 from tcmrl_data import Dataset, Recipe
 from tests.namespace import has_only_loopback
 from tests.workers import MARK, ROOT
+
+sys.path.append(str(Path(__file__).parent / "doubles"))  # a distribution: methods as plug-ins
 
 TASKS = [0, 3, 40, 60, 99]
 TINY = (

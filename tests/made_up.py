@@ -7,37 +7,46 @@ import numpy as np
 import torch
 
 from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.stages import Stage, StagePlan
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, Steps, Trajectory
+from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Trajectory, Transitions, Windows
 
 TASKS, EPISODE = 3, 6
+OBSERVATION_DIM, ACTION_DIM = 3, 2
+TRAINING_TASKS = (2, 5, 9)
+ONE_STAGE = StagePlan((Stage("train", 100, BatchRequest(TASKS, {"policy": Transitions(5)})),), steps=100)
 
 
-def problem(*, sparse: bool = False, seed: int = 0) -> Problem:
+def problem(
+    *, sparse: bool = False, seed: int = 0, stages: StagePlan = ONE_STAGE, privileged: bool = False
+) -> Problem:
     return Problem(
         environment="made-up",
-        observation_dim=3,
-        action_dim=2,
+        observation_dim=OBSERVATION_DIM,
+        action_dim=ACTION_DIM,
         horizon=EPISODE,
         reward_density="sparse" if sparse else "dense",
-        observation_mean=torch.zeros(3),
-        observation_std=torch.ones(3),
-        change_mean=torch.zeros(3),
-        change_std=torch.full((3,), 0.5),
-        action_mean=torch.zeros(2),
-        action_std=torch.ones(2),
+        observation_mean=torch.zeros(OBSERVATION_DIM),
+        observation_std=torch.ones(OBSERVATION_DIM),
+        change_mean=torch.zeros(OBSERVATION_DIM),
+        change_std=torch.full((OBSERVATION_DIM,), 0.5),
+        action_mean=torch.zeros(ACTION_DIM),
+        action_std=torch.ones(ACTION_DIM),
         reward_mean=0.0,
         reward_std=1.0,
         reward_range=(-2.0, 1.0),
         seed=seed,
-        steps=100,
+        stages=stages,
+        training_tasks=TRAINING_TASKS,
+        privileged=torch.tensor([[-1.0, 0.5], [0.0, -1.0], [1.0, 0.5]]) if privileged else None,
         device=torch.device("cpu"),
     )
 
 
-def settings(**actor_critic: Any) -> TrainingSettings:
+def settings(*, steps: int = 100, **actor_critic: Any) -> TrainingSettings:
     return TrainingSettings.model_validate(
         {
+            "run": {"steps": steps},
             "batch": {"tasks": TASKS, "transitions": 5, "execution_trajectories": 1, "window_length": 2},
             "optimizer": {"learning_rate": 1e-2},
             "actor_critic": {"hidden": (8,), **actor_critic},
@@ -55,19 +64,31 @@ def steps(*shape: int, seed: int, lengths: tuple[int, ...] | None = None) -> Ste
 
 
 def batch(*, lengths: tuple[int, ...] | None = (6, 4, 5), trajectories: int = 2) -> Batch:
-    return Batch(
-        task_indices=torch.arange(TASKS),
-        steps={
-            "policy": steps(TASKS, 5, seed=1),
-            "context": steps(TASKS, trajectories, EPISODE, seed=2, lengths=lengths),
-            "execution": steps(TASKS, 1, EPISODE, seed=3, lengths=lengths),
-        },
-    )
+    kinds = {
+        "policy": steps(TASKS, 5, seed=1),
+        "context": steps(TASKS, trajectories, EPISODE, seed=2, lengths=lengths),
+        "execution": steps(TASKS, 1, EPISODE, seed=3, lengths=lengths),
+    }
+    return Batch(torch.tensor(TRAINING_TASKS), kinds)
 
 
-def with_steps(plain: Batch, **steps: Steps) -> Batch:
+def batch_for(request: BatchRequest, *, seed: int) -> Batch:
+    """A batch as a sampler makes it for a request; episodes end early."""
+    kinds = {}
+    for place, (name, kind) in enumerate(request.kinds.items()):
+        shape: tuple[int, ...] = (TASKS, kind.number)
+        if isinstance(kind, Trajectories):
+            shape += (EPISODE,)
+        elif isinstance(kind, Windows):
+            shape += (kind.length,)
+        lengths = (6, 4, 5) if isinstance(kind, Trajectories) else None
+        kinds[name] = steps(*shape, seed=100 * seed + place, lengths=lengths)
+    return Batch(torch.tensor(TRAINING_TASKS), kinds)
+
+
+def with_steps(plain: Batch, **changed: Steps) -> Batch:
     """The batch with other steps for some kinds."""
-    return replace(plain, steps={**plain.steps, **steps})
+    return replace(plain, steps={**plain.steps, **changed})
 
 
 def trajectory(length: int, seed: int) -> Trajectory:

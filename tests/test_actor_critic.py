@@ -127,3 +127,35 @@ def test_the_largest_q_is_that_of_any_critic_and_row() -> None:
         actor_critic.critics.members[1].layers[-1].bias.fill_(-500.0)
     _, metrics = actor_critic.losses(rows, torch.Generator().manual_seed(0))
     assert metrics["actor_critic/largest_q"].item() == pytest.approx(500.0, abs=5.0)
+
+
+@pytest.mark.parametrize("critic_gradient", [False, True])
+def test_the_critics_gradient_reaches_contexts_only_where_asked(critic_gradient: bool) -> None:
+    made = ActorCriticSettings.model_validate({"hidden": (8,), "brac": {"mode": "value"}})
+    actor_critic = ActorCritic(made, problem(), latent=2, generator=torch.Generator().manual_seed(0))
+    context = torch.ones(TASKS, 2, requires_grad=True)
+    rows = actor_critic.rows(steps(TASKS, 5, seed=1), context, critic_gradient=critic_gradient)
+    _, metrics = actor_critic.losses(rows, torch.Generator().manual_seed(0))
+    reached = {}
+    for name in ("loss/critic", "loss/value", "loss/policy"):
+        (gradient,) = torch.autograd.grad(metrics[name], context, retain_graph=True, allow_unused=True)
+        reached[name] = gradient is not None and bool(gradient.any())
+    assert reached == {"loss/critic": critic_gradient, "loss/value": False, "loss/policy": False}
+    detached = actor_critic.rows(steps(TASKS, 5, seed=1), context.detach())
+    torch.testing.assert_close(rows.critic_inputs, detached.inputs)
+
+
+def test_a_context_of_every_step_stands_beside_its_step_and_padding_is_left_out() -> None:
+    made = ActorCriticSettings(hidden=(8,))
+    actor_critic = ActorCritic(made, problem(), latent=1, generator=torch.Generator().manual_seed(0))
+    episodes = steps(TASKS, 2, 6, seed=1, lengths=(6, 4, 5))
+    numbers = torch.arange(episodes.mask.numel()).view(*episodes.mask.shape, 1).float()
+    rows = actor_critic.rows(episodes, numbers, numbers + 0.5)
+    expected = numbers[episodes.mask]
+    assert len(expected) == 30
+    torch.testing.assert_close(rows.inputs[:, -1:], expected)
+    torch.testing.assert_close(rows.next_inputs[:, -1:], expected + 0.5)
+    torch.testing.assert_close(rows.actions, episodes.actions[episodes.mask])
+    torch.testing.assert_close(rows.rewards, episodes.rewards[episodes.mask] * made.reward_scale)
+    same = actor_critic.rows(episodes, torch.zeros(TASKS, 1))
+    torch.testing.assert_close(rows.inputs[:, :-1], same.inputs[:, :-1])

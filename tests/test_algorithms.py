@@ -1,227 +1,221 @@
-"""What every method keeps: determinism, tensors, adaptation; and what FOCAL and the control are."""
+"""What every method keeps: determinism, stages, tensors, adaptation as its capabilities say."""
 
+import inspect
 from dataclasses import replace
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from torch import Tensor
 
-from tcmrl_algo.actor_critic.actor_critic import ActorCritic
-from tcmrl_algo.algorithms import focal, no_context
-from tcmrl_algo.context_methods.learner import (
-    ContextAlgorithm,
-    ContextController,
-    ContextLearner,
-    ContextLosses,
-    pack,
-)
-from tcmrl_algo.losses import context as losses
-from tcmrl_algo.methods.problem import Algorithm
-from tcmrl_algo.networks.optimizer import Adam
-from tcmrl_algo.training.config import ALGORITHMS
-from tcmrl_data import (
-    Batch,
-    BatchRequest,
-    Controller,
-    Steps,
-    Trajectories,
-    Transitions,
-    UniformController,
-)
-from tcmrl_data.foundation.plugins import modules
-from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, trajectory, with_steps
+from tcmrl_algo.methods.base import METHODS, Algorithm, Method
+from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.stages import StagePlan
+from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_data import Batch, Controller, Steps, Trajectory, Transition, UniformController
+from tests.made_up import ACTION_DIM, OBSERVATION_DIM, TASKS, batch_for, problem, settings, trajectory
 
-FOUND = modules(ALGORITHMS)
-BLIND = ("no_context",)
-every = pytest.mark.parametrize("module", FOUND, ids=lambda module: module.NAME)
+STEPS = 6
+"""Of the whole training here: more than the doubles' first stages take, fewer than a second."""
+every = pytest.mark.parametrize("name", METHODS.names())
 
 
-def make(module: ModuleType, *, seed: int = 0, **actor_critic: Any) -> Algorithm:
-    made: Algorithm = module.create(problem(seed=seed), settings(**actor_critic), module.Config())
-    return made
+class Made:
+    """A method, the plan of its stages, and batches for every step."""
+
+    def __init__(self, name: str, *, seed: int = 0, **actor_critic: Any) -> None:
+        self.method: Method[Any] = METHODS.get(name)()
+        self.settings: TrainingSettings = settings(steps=STEPS, **actor_critic)
+        self.config = self.method.Config()
+        self.stages = StagePlan(self.method.stages(self.settings, self.config), steps=STEPS)
+        self.problem: Problem = problem(
+            seed=seed, stages=self.stages, privileged=self.method.capabilities.privileged
+        )
+        self.algorithm: Algorithm = self.method.create(self.problem, self.settings, self.config)
+
+    def batch(self, step: int) -> Batch:
+        """What the sampler gives at a step: what its stage requests, and nothing else."""
+        stage = self.stages.at(step).stage
+        (request,) = [found.request for found in self.stages if found.name == stage]
+        return batch_for(request, seed=step)
+
+    def train(self, first: int, last: int) -> None:
+        for step in range(first, last + 1):
+            self.algorithm.update(self.batch(step), step)
+
+    def adapt(self, lanes: list[list[Trajectory]], tasks: tuple[int, ...] = (0, 1)) -> Controller:
+        """Adapted to the trajectories; by the parameters of these training tasks where they may be seen."""
+        known = self.problem.privileged
+        return self.algorithm.adapt(lanes, privileged=None if known is None else known[list(tasks)])
+
+    def snapshot(self) -> dict[str, Tensor]:
+        return {name: value.clone() for name, value in self.algorithm.tensors().items()}
 
 
-def request_of(module: ModuleType) -> BatchRequest:
-    made: BatchRequest = module.batch_request(settings(), module.Config())
-    return made
+def act(controller: Controller, lanes: int = 2) -> np.ndarray:
+    states = np.linspace(-1.0, 1.0, OBSERVATION_DIM, dtype=np.float32)
+    noise = np.zeros((lanes, ACTION_DIM), dtype=np.float32)
+    return controller.act(np.tile(states, (lanes, 1)), noise)
 
 
-def batch_for(module: ModuleType) -> Batch:
-    """What the sampler gives for the method's request: nothing beyond."""
-    found: dict[str, Steps] = {}
-    for seed, (name, kind) in enumerate(request_of(module).kinds.items()):
-        length = EPISODE if isinstance(kind, Trajectories) else kind.length
-        shape = (TASKS, kind.number) if isinstance(kind, Transitions) else (TASKS, kind.number, length)
-        found[name] = steps(*shape, seed=seed)
-    return Batch(torch.arange(TASKS), found)
+LANES = [[trajectory(6, 0)], [trajectory(4, 1), trajectory(2, 2)]]
 
 
-@every
-def test_a_method_is_one_file_with_four_names(module: ModuleType) -> None:
-    assert module.__name__.rpartition(".")[2] == module.NAME
-    assert module.Config.model_config == {"frozen": True, "extra": "forbid"}
-    assert isinstance(request_of(module), BatchRequest)
-    assert isinstance(make(module), Algorithm)
-
-
-@every
-def test_settings_are_documented(module: ModuleType) -> None:
-    for name in module.Config.model_fields:
-        assert f"{name}:" in (module.Config.__doc__ or "")
+def assert_equal(first: dict[str, Tensor], second: dict[str, Tensor]) -> None:
+    assert first.keys() == second.keys()
+    for name, value in first.items():
+        assert torch.equal(value, second[name]), name
 
 
 @every
-def test_updates_are_a_function_of_seed_and_step(module: ModuleType) -> None:
+def test_a_method_is_complete_and_its_settings_are_documented(name: str) -> None:
+    method = METHODS.get(name)
+    assert method.name == name
+    assert not inspect.signature(method).parameters
+    assert method.Config.model_config.get("frozen") and method.Config.model_config.get("extra") == "forbid"
+    for field in method.Config.model_fields:
+        assert f"{field}:" in (method.Config.__doc__ or ""), field
+
+
+@every
+def test_updates_are_a_function_of_seed_and_step(name: str) -> None:
     results = []
     for global_seed in (0, 1):
         torch.manual_seed(global_seed)
-        method = make(module)
-        for step in (1, 2, 3):
-            metrics = method.update(batch_for(module), step)
-            assert all(each.shape == () and torch.isfinite(each) for each in metrics.values())
-        results.append(method.tensors())
-    for name, each in results[0].items():
-        assert torch.equal(each, results[1][name]), name
-    other = make(module, seed=1).tensors()
-    assert any(not torch.equal(each, results[0][name]) for name, each in other.items())
+        made = Made(name)
+        for step in range(1, STEPS + 1):
+            metrics = made.algorithm.update(made.batch(step), step)
+            assert all(value.shape == () and torch.isfinite(value) for value in metrics.values())
+        results.append(made.algorithm.tensors())
+    assert_equal(*results)
+    other = Made(name, seed=1).algorithm.tensors()
+    assert any(not torch.equal(value, results[0][name]) for name, value in other.items())
 
 
 @every
-@pytest.mark.parametrize("mode", ["off", "policy", "value"])
-def test_a_learner_goes_on_from_its_tensors(module: ModuleType, mode: str) -> None:
-    straight, first, second = (make(module, brac={"mode": mode}) for _ in range(3))
-    for step in (1, 2, 3, 4):
-        straight.update(batch_for(module), step)
-    for step in (1, 2):
-        first.update(batch_for(module), step)
-    second.load_tensors({name: each.clone() for name, each in first.tensors().items()})
-    for step in (3, 4):
-        second.update(batch_for(module), step)
-    expected, found = straight.tensors(), second.tensors()
-    assert expected.keys() == found.keys()
-    for name, each in expected.items():
-        assert torch.equal(each, found[name]), name
+@pytest.mark.parametrize("mode", ["off", "value"])
+def test_a_learner_goes_on_from_its_tensors_at_every_step(name: str, mode: str) -> None:
+    """In the middle of a stage and at its end, the next step is that of an uninterrupted training."""
+    straight = Made(name, brac={"mode": mode})
+    for step in range(1, STEPS + 1):
+        resumed = Made(name, brac={"mode": mode})
+        resumed.algorithm.load_tensors(straight.snapshot())
+        for made in (straight, resumed):
+            made.train(step, step)
+        assert_equal(straight.algorithm.tensors(), resumed.algorithm.tensors())
 
 
 @every
-def test_adapted_controller_acts_by_each_lanes_trajectories(module: ModuleType) -> None:
-    lanes = [[trajectory(6, 0)], [trajectory(4, 1), trajectory(2, 2)]]
-    method = make(module)
-    assert isinstance(method.explore([[], []]), UniformController)
-    controller = method.adapt(lanes)
-    states, noise = np.zeros((2, 3), dtype=np.float32), np.zeros((2, 2), dtype=np.float32)
-    actions = controller.act(states, noise)
-    assert actions.shape == (2, 2)
-    assert np.abs(actions).max() <= 1
-    assert np.allclose(actions[0], actions[1]) is (module.NAME in BLIND)
-    np.testing.assert_array_equal(controller.act(states, noise + 1.0), actions)  # no exploration
-    alone = [method.adapt([lane]).act(states[:1], noise[:1])[0] for lane in lanes]
+def test_padding_changes_no_update(name: str) -> None:
+    plain, padded = Made(name), Made(name)
+    for step in range(1, STEPS + 1):
+        plain.algorithm.update(plain.batch(step), step)
+        other = padded.batch(step)
+        steps = {kind: scramble(other[kind]) for kind in other.names()}
+        padded.algorithm.update(replace(other, steps=steps), step)
+    expected, found = plain.algorithm.tensors(), padded.algorithm.tensors()
+    for key, value in expected.items():
+        torch.testing.assert_close(found[key], value, msg=key, rtol=1e-3, atol=1e-4)
+
+
+def scramble(values: Steps) -> Steps:
+    """The same real steps with other padding."""
+
+    def other(value: Tensor) -> Tensor:
+        mask = values.mask.reshape(values.mask.shape + (1,) * (value.ndim - values.mask.ndim))
+        return torch.where(mask, value, value + 3.0)
+
+    names = ("observations", "actions", "rewards", "next_observations")
+    return replace(values, **{name: other(getattr(values, name)) for name in names})
+
+
+@every
+def test_adaptation_changes_no_tensor_and_follows_every_lane_alone(name: str) -> None:
+    made = Made(name)
+    made.train(1, STEPS)
+    before = made.snapshot()
+    actions = act(made.adapt(LANES))
+    assert actions.shape == (2, ACTION_DIM)
+    assert np.isfinite(actions).all() and np.abs(actions).max() <= 1
+    alone = [act(made.adapt([lane], tasks=(index,)), lanes=1)[0] for index, lane in enumerate(LANES)]
     np.testing.assert_allclose(np.array(alone), actions, rtol=1e-4, atol=1e-6)  # neighbours play no part
+    assert_equal(before, made.algorithm.tensors())
 
 
-def test_every_step_has_its_own_generator() -> None:
-    places = [(1, 0), (2, 0), (1, 1), (1, 0)]
-    draws = [torch.rand(3, generator=problem().generator(*each)) for each in places]
-    assert torch.equal(draws[0], draws[3])
-    assert not torch.equal(draws[0], draws[1])
-    assert not torch.equal(draws[0], draws[2])
-    assert not torch.equal(torch.rand(3, generator=problem(seed=1).generator(1)), draws[0])
+@every
+def test_trajectories_matter_unless_the_method_is_blind(name: str) -> None:
+    made = Made(name)
+    made.train(1, STEPS)
+    actions = act(made.adapt(LANES, tasks=(0, 0)))
+    assert np.allclose(actions[0], actions[1], atol=1e-7) is made.method.capabilities.blind
 
 
-def test_packed_trajectories_keep_their_steps_and_mask_the_rest() -> None:
-    lanes = [[trajectory(6, 0)], [trajectory(4, 1), trajectory(2, 2)]]
-    packed = pack(lanes, torch.device("cpu"))
-    assert packed.mask.sum(dim=-1).tolist() == [[6, 0], [4, 2]]
-    expected = torch.from_numpy(lanes[1][1].observations[1:])
-    torch.testing.assert_close(packed.next_observations[1, 1, :2], expected)
+@every
+def test_task_parameters_matter_where_a_method_may_see_them(name: str) -> None:
+    made = Made(name)
+    same = [LANES[0], LANES[0]]
+    actions = act(made.adapt(same, tasks=(0, 1)))
+    assert np.allclose(actions[0], actions[1], atol=1e-7) is not made.method.capabilities.privileged
 
 
-def test_no_context_needs_no_trajectories() -> None:
-    assert request_of(no_context) == BatchRequest(tasks=TASKS, kinds={"policy": Transitions(5)})
+@every
+def test_steps_change_how_a_controller_acts_only_where_it_is_stateful(name: str) -> None:
+    made = Made(name)
+    controller = made.adapt(LANES)
+    before = act(controller)
+    np.testing.assert_array_equal(act(controller), before)  # no exploration
+    controller.observe(observed(active=(True, False)))
+    after = act(controller)
+    np.testing.assert_array_equal(after[1], before[1])  # a lane that has ended stands still
+    assert np.array_equal(after[0], before[0]) is not made.method.capabilities.stateful
 
 
-def focal_learner() -> ContextLearner:
-    made = focal.create(problem(), settings(), focal.Config(latent=4, encoder_hidden=(8,)))
-    assert isinstance(made, ContextAlgorithm)
-    return made.learner
+def observed(*, active: tuple[bool, ...]) -> Transition:
+    """One step of several lanes."""
+    random, lanes = np.random.default_rng(0), len(active)
+    states = random.normal(size=(2, lanes, OBSERVATION_DIM)).astype(np.float32)
+    ended = np.zeros(lanes, dtype=bool)
+    actions = random.uniform(-1, 1, (lanes, ACTION_DIM)).astype(np.float32)
+    rewards = random.normal(size=lanes).astype(np.float32)
+    return Transition(states[0], actions, rewards, states[1], ended, ended, np.array(active))
 
 
-def test_focal_pulls_the_means_of_a_tasks_trajectories_together() -> None:
-    made, values = focal_learner(), batch()
-    assert isinstance(made, focal.FocalLearner)
-    found = made.losses(values, 1, torch.Generator())
-    groups = (made.encoder.read(values["context"]), made.encoder.read(values["execution"]))
-    context, execution = made.encoder(*groups)
-    single = torch.stack(
-        [
-            torch.stack([each[mask].mean(dim=0) for each, mask in zip(lane, real, strict=True)])
-            for lane, real in zip(
-                torch.cat([context, execution], dim=1),
-                torch.cat([each.mask for each in groups], dim=1),
-                strict=True,
-            )
-        ]
-    )
-    torch.testing.assert_close(found.total, losses.distance_metric_loss(single, epsilon=0.1))
-    for lane, values_of in enumerate(context):
-        torch.testing.assert_close(found.context[lane], values_of[groups[0].mask[lane]].mean(dim=0))
+@every
+def test_no_trajectory_is_a_context_where_the_method_needs_none(name: str) -> None:
+    made = Made(name)
+    if made.method.capabilities.needs_trajectories:
+        return
+    made.train(1, STEPS)
+    actions = act(made.adapt([[], LANES[0]]))
+    assert np.isfinite(actions).all()
+    np.testing.assert_allclose(actions[0], act(made.adapt([[]], tasks=(0,)), lanes=1)[0], rtol=1e-5)
 
 
-def test_focal_gathers_each_tasks_contexts() -> None:
-    """The measured ratio of distances within and between tasks falls as it trains."""
-    made = focal.create(problem(), settings(), focal.Config(latent=4, encoder_hidden=(16,)))
-    assert isinstance(made, ContextAlgorithm)
-
-    def shifted(values: Steps) -> Steps:
-        offset = torch.arange(TASKS).view(TASKS, 1, 1) - 1.0
-        return replace(values, rewards=values.rewards + offset)  # tasks differ in their reward
-
-    values = batch(lengths=None)
-    values = with_steps(values, context=shifted(values["context"]), execution=shifted(values["execution"]))
-
-    def ratio() -> float:
-        parts = (values["context"], values["execution"])
-        contexts = torch.stack([made.learner.context(each) for each in parts]).detach()
-        within = (contexts[0] - contexts[1]).norm(dim=-1).mean()
-        between = (contexts[0].roll(1, 0) - contexts[1]).norm(dim=-1).mean()
-        return float(within / between)
-
-    before = ratio()
-    for step in range(1, 60):
-        made.update(values, step)
-    assert ratio() < 0.5 * before
+@every
+def test_exploration_is_uniform_unless_the_method_says_otherwise(name: str) -> None:
+    made = Made(name)
+    own = not isinstance(made.algorithm.explore([[], []]), UniformController)
+    assert own is made.method.capabilities.explores
+    assert act(made.algorithm.explore([[], []])).shape == (2, ACTION_DIM)
 
 
-def test_a_learner_may_collect_and_optimise_in_its_own_way() -> None:
-    """What CSRO needs: a network trained within `losses`, kept in checkpoints, and its own first episodes."""
+@every
+def test_rewards_that_are_all_zero_train_and_adapt(name: str) -> None:
+    made = Made(name)
+    for step in range(1, STEPS + 1):
+        drawn = made.batch(step)
+        steps = {kind: without_rewards(drawn[kind]) for kind in drawn.names()}
+        metrics = made.algorithm.update(replace(drawn, steps=steps), step)
+        assert all(torch.isfinite(value) for value in metrics.values())
+    lanes = [[replace(found, rewards=np.zeros_like(found.rewards)) for found in lane] for lane in LANES]
+    assert np.isfinite(act(made.adapt(lanes))).all()
 
-    class Own(ContextLearner):
-        latent = 0
 
-        def __init__(self) -> None:
-            super().__init__()
-            self.inner = torch.nn.Linear(1, 1)
-            self.adam = Adam(self.inner, learning_rate=0.1)
+def without_rewards(values: Steps) -> Steps:
+    return replace(values, rewards=torch.zeros_like(values.rewards))
 
-        def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
-            self.adam.step(self.inner.weight.sum())
-            zero = batch["policy"].rewards.new_zeros(())
-            return ContextLosses(zero, zero.new_zeros(TASKS, 0), {})
 
-        def context(self, steps: Steps) -> torch.Tensor:
-            return steps.rewards.new_zeros(len(steps.rewards), 0)
-
-        def optimizers(self) -> dict[str, Adam]:
-            return {"inner": self.adam}
-
-        def explore(self, actor_critic: ActorCritic, trajectories: Any) -> Controller:
-            return ContextController(actor_critic, torch.zeros(len(trajectories), 0))
-
-    method = ContextAlgorithm(problem(), settings(), learner=Own())
-    before = method.learner.inner.weight.item()
-    method.update(batch(), 1)
-    assert method.learner.inner.weight.item() == pytest.approx(before - 0.1)  # one step of its own alone
-    assert "optimizer/inner/weight/step" in method.tensors()
-    assert isinstance(method.explore([[], []]), ContextController)
+def test_tasks_of_a_batch_are_found_among_the_training_tasks() -> None:
+    assert TASKS == 3
+    assert problem().position(torch.tensor([9, 2])).tolist() == [2, 0]

@@ -6,8 +6,10 @@ import pytest
 import torch
 
 from tcmrl_algo import resolve
-from tcmrl_algo.training.batches import Batches, JoinedBatches, only_transitions, open_batches
-from tcmrl_algo.training.train import batch_request
+from tcmrl_algo.methods.stages import Stage, StagePlan
+from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.training.batches import JoinedBatches, StagedBatches, only_transitions, open_batches
+from tcmrl_algo.training.config import stage_plan
 from tcmrl_data import (
     BatchRequest,
     Dataset,
@@ -19,13 +21,13 @@ from tcmrl_data import (
 )
 
 
-def open_with(dataset: Dataset, *overrides: str, algorithm: str = "tcmrl") -> Batches:
+def open_with(dataset: Dataset, *overrides: str, algorithm: str = "tcmrl") -> StagedBatches:
     table = dataset.manifest.training["quick"]
     config = resolve(table, place="quick", algorithm=algorithm, overrides=overrides)
     return open_batches(
         dataset,
         config.settings.run,
-        batch_request(config),
+        stage_plan(config),
         seed=0,
         device=torch.device("cpu"),
         memory_limit=None,
@@ -61,7 +63,7 @@ def test_joined_batches_take_each_kind_from_its_selection(tiny: Dataset) -> None
 def test_contexts_from_the_same_snapshots_are_those_of_one_selection(tiny: Dataset, rule: str) -> None:
     one = open_with(tiny, f"run.snapshots={rule}")
     two = open_with(tiny, f"run.snapshots={rule}", f"run.context_snapshots={rule}")
-    assert isinstance(two, JoinedBatches)
+    assert isinstance(two._batches, JoinedBatches)
     for n in range(70):  # more than one block of draws
         first, second = one.batch(n), two.batch(n)
         assert set(first.names()) == set(second.names())
@@ -73,5 +75,32 @@ def test_contexts_from_the_same_snapshots_are_those_of_one_selection(tiny: Datas
 
 def test_an_algorithm_without_contexts_draws_none(tiny: Dataset) -> None:
     alone = open_with(tiny, "run.context_snapshots=last", algorithm="no_context")
-    assert isinstance(alone, Sampler)
+    assert isinstance(alone._batches, Sampler)
     assert alone.batch(0).names() == ["policy"]
+
+
+@pytest.mark.parametrize("context_snapshots", [None, "last"])
+def test_every_stage_gets_what_it_requests_of_one_stream(
+    tiny: Dataset, context_snapshots: str | None
+) -> None:
+    rows, episodes = {"rows": Transitions(3)}, {"episodes": Trajectories(1)}
+    kinds = {"first": rows, "second": episodes, "third": rows | episodes}
+    stages = [Stage(name, 2, BatchRequest(3, kind)) for name, kind in kinds.items()]
+    run = RunSettings(context_snapshots=context_snapshots)
+
+    def opened(chosen: list[Stage]) -> StagedBatches:
+        return open_batches(
+            tiny,
+            run,
+            StagePlan(chosen, steps=2 * len(chosen)),
+            seed=0,
+            device=torch.device("cpu"),
+            memory_limit=None,
+            say=lambda message: None,
+        )
+
+    staged, whole = opened(stages), opened(stages[2:])
+    names = [["rows"], ["rows"], ["episodes"], ["episodes"], ["rows", "episodes"], ["rows", "episodes"]]
+    assert [sorted(staged.batch(n).names()) for n in range(6)] == [sorted(found) for found in names]
+    assert torch.equal(staged.batch(4)["episodes"].rewards, whole.batch(4)["episodes"].rewards)
+    assert staged.moments().reward_mean == whole.moments().reward_mean

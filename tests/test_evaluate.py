@@ -20,7 +20,7 @@ from tcmrl_algo import Evaluation, TaskResult, evaluate_run, resolve, train_run
 from tcmrl_algo.adaptation.arena import Arena
 from tcmrl_algo.adaptation.evaluate import contexts_of_others
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
-from tcmrl_algo.methods.problem import Algorithm, Metrics
+from tcmrl_algo.methods.base import Algorithm, Metrics
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_data import (
     Batch,
@@ -61,7 +61,9 @@ class GoalReader(Algorithm):
     def update(self, batch: Batch, step: int) -> Metrics:
         raise AssertionError("never trained")
 
-    def adapt(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
+    def adapt(
+        self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
+    ) -> Controller:
         self.seen.append([len(lane) for lane in trajectories])
         angles = np.linspace(0.0, np.pi, 100)
         goals = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
@@ -164,7 +166,9 @@ def test_idaq_keeps_a_training_context_that_nothing_beats(two_tests: Dataset) ->
     class Stubborn(GoalReader):
         """Good under the first context it sees, bad under all others."""
 
-        def adapt(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
+        def adapt(
+            self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
+        ) -> Controller:
             self.seen.append([0])
             goal = [0.0, 1.0] if len(self.seen) == 1 else [0.0, -9.0]
             return GoalController(np.array([goal] * len(trajectories)))
@@ -179,7 +183,9 @@ def test_idaq_keeps_a_training_context_that_nothing_beats(two_tests: Dataset) ->
 
 def test_idaq_keeps_the_first_of_equal_contexts(two_tests: Dataset) -> None:
     class Indifferent(GoalReader):
-        def adapt(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
+        def adapt(
+            self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
+        ) -> Controller:
             return GoalController(np.array([[0.0, 1.0]] * len(trajectories)))
 
     place = arena(two_tests, Indifferent(), episodes=5)

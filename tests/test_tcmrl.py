@@ -20,10 +20,10 @@ ONLY = dict.fromkeys(tcmrl.Weights.model_fields, 0.0)
 def method(
     config: dict[str, Any] | None = None, *, sparse: bool = False, seed: int = 0, **more: Any
 ) -> ContextAlgorithm:
-    made = tcmrl.create(
+    made = tcmrl.Tcmrl().create(
         problem(sparse=sparse, seed=seed),
         settings(**more),
-        tcmrl.Config.model_validate(SMALL | (config or {})),
+        tcmrl.TcmrlConfig.model_validate(SMALL | (config or {})),
     )
     assert isinstance(made, ContextAlgorithm)
     return made
@@ -211,13 +211,13 @@ def test_a_switch_changes_its_own_terms_and_nothing_else(change: dict[str, Any],
 def test_k_is_the_length_of_the_windows(window_length: int) -> None:
     made = settings()
     sizes = made.batch.model_copy(update={"window_length": window_length})
-    config = tcmrl.Config.model_validate(SMALL)
-    other = tcmrl.TcmrlLearner(problem(), made.model_copy(update={"batch": sizes}), config)
-    (representations,) = other.encoder(context := other.encoder.read(batch()["context"]))
+    config = tcmrl.TcmrlConfig.model_validate(SMALL)
+    changed = tcmrl.TcmrlLearner(problem(), made.model_copy(update={"batch": sizes}), config)
+    (representations,) = changed.encoder(context := changed.encoder.read(batch()["context"]))
     expected = task_contrastive_loss(
-        representations, context.mask, other.similarity, window_length=window_length
+        representations, context.mask, changed.similarity, window_length=window_length
     )
-    found = losses_of(other).metrics
+    found = losses_of(changed).metrics
     torch.testing.assert_close(found["loss/contrastive"], expected)
     first = losses_of(learner()).metrics
     different = {name for name, each in first.items() if not torch.equal(each, found[name])}
@@ -238,8 +238,9 @@ def test_rewards_are_estimated_by_transition_or_by_trajectory(level: str, sparse
     made = learner({"reward_estimation": level, "weights": ONLY | {"positive": 1.0}}, sparse=sparse)
     assert made.estimates_trajectories is whole
     plain = batch(lengths=None)
-    execution = plain["execution"]
-    moved = with_steps(plain, execution=replace(execution, rewards=execution.rewards.roll(1, 2)))
+    moved = with_steps(
+        plain, execution=replace(plain["execution"], rewards=plain["execution"].rewards.roll(1, 2))
+    )
     first, second = losses_of(made, plain).total.item(), losses_of(made, moved).total.item()
     assert (first == pytest.approx(second, rel=1e-5)) is whole
 

@@ -16,16 +16,15 @@ from tcmrl_cli.train import tcmrl
 import tcmrl_algo
 from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
 from tcmrl_algo.algorithms import tcmrl as tcmrl_module
+from tcmrl_algo.methods.base import METHODS
 from tcmrl_algo.settings.actor_critic import ActorCriticSettings
 from tcmrl_algo.settings.batch import BatchSettings
 from tcmrl_algo.settings.brac import BracSettings
 from tcmrl_algo.settings.optimizer import OptimizerSettings
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_algo.training.config import ALGORITHMS
 from tcmrl_algo.training.train import Progress
 from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
-from tcmrl_data.foundation.plugins import modules
 from tests.commands import Call, assert_refused, in_process
 
 SMALL = (
@@ -112,7 +111,7 @@ def test_unknown_algorithm_names_the_nearest(tiny: Dataset) -> None:
         config_of(tiny, algorithm="tcmlr")
 
 
-@pytest.mark.parametrize("algorithm", [module.NAME for module in modules(ALGORITHMS)])
+@pytest.mark.parametrize("algorithm", METHODS.names())
 def test_one_seed_gives_the_same_parameters_after_100_steps(start: Train, algorithm: str) -> None:
     first = start("first", algorithm=algorithm, steps=100, seed=3)
     torch.manual_seed(12345)  # the global state plays no part
@@ -408,7 +407,7 @@ def test_public_names_load() -> None:
         BatchSettings,
         ActorCriticSettings,
         BracSettings,
-        tcmrl_module.Config,
+        tcmrl_module.TcmrlConfig,
         tcmrl_module.Weights,
     ],
     ids=lambda table: table.__name__,

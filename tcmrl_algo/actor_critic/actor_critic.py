@@ -1,6 +1,5 @@
 """The offline actor-critic under every context-based method: two Q, V with a target, a Gaussian policy."""
 
-import copy
 from typing import final
 
 import torch
@@ -10,7 +9,9 @@ from torch import Tensor, nn
 from tcmrl_algo.actor_critic.brac import DualCritic
 from tcmrl_algo.actor_critic.rows import ConditionedRows
 from tcmrl_algo.losses.actor_critic import policy_loss, q_loss, value_loss
-from tcmrl_algo.methods.problem import Metrics, Problem
+from tcmrl_algo.methods.base import Metrics
+from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.networks.momentum import follow, momentum_copy
 from tcmrl_algo.networks.optimizer import Adam
 from tcmrl_algo.networks.perceptron import Perceptron, PerceptronEnsemble, Standardizer, call_frozen
 from tcmrl_algo.networks.policy import PolicyActions, PolicyNetwork
@@ -34,7 +35,7 @@ def value_bounds(settings: ActorCriticSettings, problem: Problem) -> tuple[float
 
 @final
 class ActorCritic(nn.Module):
-    """Critics and policy conditioned on a context whose gradient they never touch.
+    """Critics and policy conditioned on a context, which the critics alone may train, where asked.
 
     Args:
         settings: the resolved table.
@@ -54,7 +55,7 @@ class ActorCritic(nn.Module):
         with_action = (inputs + problem.action_dim, *hidden)
         self.critics = PerceptronEnsemble(2, with_action, generator=generator)
         self.value = Perceptron((inputs, *hidden, 1), generator=generator)
-        self.target_value = copy.deepcopy(self.value).requires_grad_(False)
+        self.target_value = momentum_copy(self.value)
         self.policy = PolicyNetwork(
             inputs,
             problem.action_dim,
@@ -66,19 +67,39 @@ class ActorCritic(nn.Module):
         if settings.brac.mode != "off":
             self.brac = DualCritic(settings.brac, with_action, generator=generator)
 
-    def rows(self, steps: Steps, context: Float[Tensor, "tasks latent"]) -> ConditionedRows:
-        """Flattens transitions (tasks, n) and gives each its task's context, detached."""
-        num_rows = steps.rewards.numel()
-        spread = context.detach().unsqueeze(1).expand(-1, steps.rewards.shape[1], -1).reshape(num_rows, -1)
-        states = torch.stack([steps.observations, steps.next_observations]).reshape(2, num_rows, -1)
-        inputs = torch.cat([self.scaling(states), spread.expand(2, -1, -1)], dim=-1)
-        return ConditionedRows(
+    def rows(
+        self,
+        steps: Steps,
+        context: Float[Tensor, "tasks *steps latent"],
+        next_context: Float[Tensor, "tasks *steps latent"] | None = None,
+        *,
+        critic_gradient: bool = False,
+    ) -> ConditionedRows:
+        """Flattens the steps of all tasks and puts a context beside each.
+
+        Args:
+            steps: transitions (tasks, n), or trajectories (tasks, n, steps), whose padding is left out.
+            context: (tasks, latent), or one of every step.
+            next_context: of the next observations; `context` if left out.
+            critic_gradient: leaves Q's context attached, so that Q's loss trains it; nothing else does.
+        """
+        following = context if next_context is None else next_context
+        contexts = [_by_row(value, steps) for value in (context, following)]
+        states = torch.stack([steps.observations, steps.next_observations]).flatten(1, -2)
+        detached = torch.stack([value.detach() for value in contexts])
+        inputs = torch.cat([self.scaling(states), detached], dim=-1)
+        critic_inputs = inputs[0]
+        if critic_gradient:
+            critic_inputs = torch.cat([inputs[0, :, : states.shape[-1]], contexts[0]], dim=-1)
+        rows = ConditionedRows(
             inputs[0],
+            critic_inputs,
             inputs[1],
-            steps.actions.reshape(num_rows, -1),
-            steps.rewards.reshape(num_rows) * self.settings.reward_scale,
-            steps.terminated.reshape(num_rows),
+            steps.actions.flatten(0, -2),
+            steps.rewards.flatten() * self.settings.reward_scale,
+            steps.terminated.flatten(),
         )
+        return rows.where(steps.mask.flatten()) if steps.mask.ndim > 2 else rows
 
     def losses(self, rows: ConditionedRows, generator: torch.Generator) -> tuple[Tensor, Metrics]:
         """The sum of all losses and its parts; each part trains its own network alone.
@@ -93,7 +114,7 @@ class ActorCritic(nn.Module):
             if settings.clip_targets:
                 low, high = self.bounds  # a penalised V may lie below what rewards alone add up to
                 next_values = next_values.clamp(None if settings.brac.mode == "value" else low, high)
-        q_values = self.critics(torch.cat([rows.inputs, rows.actions], dim=-1))
+        q_values = self.critics(torch.cat([rows.critic_inputs, rows.actions], dim=-1))
         critic_loss = q_loss(q_values, rows.rewards, rows.terminated, next_values, gamma=settings.gamma)
 
         noise = torch.randn(rows.actions.shape, generator=generator).to(rows.actions.device)
@@ -152,12 +173,9 @@ class ActorCritic(nn.Module):
 
     def after_step(self) -> None:
         """Moves V's target by tau towards V, and BRAC's alpha by one step of dual descent."""
-        with torch.no_grad():
-            torch._foreach_lerp_(
-                list(self.target_value.parameters()), list(self.value.parameters()), self.settings.tau
-            )
-            if self.brac is not None:
-                self.brac.adapt_alpha()
+        follow(self.target_value, self.value, step=self.settings.tau)
+        if self.brac is not None:
+            self.brac.adapt_alpha()
 
     def act(
         self, observations: Float[Tensor, "lanes observation"], context: Float[Tensor, "lanes latent"]
@@ -166,3 +184,10 @@ class ActorCritic(nn.Module):
         with torch.no_grad():
             mean, _ = self.policy(torch.cat([self.scaling(observations), context], dim=-1))
             return torch.tanh(mean)
+
+
+def _by_row(context: Float[Tensor, "tasks *steps latent"], steps: Steps) -> Float[Tensor, "rows latent"]:
+    """One context per row; a task's only one is repeated."""
+    if context.ndim == 2:
+        context = context.unsqueeze(1).expand(-1, steps.mask[0].numel(), -1)
+    return context.flatten(0, -2)

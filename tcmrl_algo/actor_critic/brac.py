@@ -24,7 +24,7 @@ class DualCritic(nn.Module):
         super().__init__()
         self.settings = settings
         self.network = Perceptron((*sizes, 1), generator=generator)
-        self.optimizer = Adam(self.network, learning_rate=settings.learning_rate)
+        self.optimizer = Adam(self.network.named_parameters(), learning_rate=settings.learning_rate)
         self.register_buffer("alpha", torch.tensor(settings.alpha))
         self.register_buffer("last_divergence", torch.tensor(0.0))
 

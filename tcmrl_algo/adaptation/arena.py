@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import final
 
-from tcmrl_algo.methods.problem import Algorithm
+from tcmrl_algo.methods.base import Algorithm
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_data import (
     Controller,

@@ -10,15 +10,14 @@ from torch import Tensor
 from tcmrl_algo.context_methods.encoding import ContextEncoder
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.losses import context as losses
-from tcmrl_algo.methods.problem import Algorithm, Problem
+from tcmrl_algo.methods.base import Algorithm, Method
+from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions
 
-NAME = "focal"
 
-
-class Config(BaseModel):
+class FocalConfig(BaseModel):
     """The `[training.focal]` table. No weight: one loss alone trains the encoder, and Adam has no scale.
 
     Attributes:
@@ -34,30 +33,11 @@ class Config(BaseModel):
     epsilon: float = Field(default=0.1, gt=0)
 
 
-def batch_request(settings: TrainingSettings, config: Config) -> BatchRequest:
-    """The `[training.batch]` table without windows."""
-    batch = settings.batch
-    return BatchRequest(
-        tasks=batch.tasks,
-        kinds={
-            "policy": Transitions(batch.transitions),
-            "context": Trajectories(batch.context_trajectories),
-            "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
-        },
-    )
-
-
-def create(problem: Problem, settings: TrainingSettings, config: Config) -> Algorithm:
-    """A new learner, its networks at their start."""
-    learner = FocalLearner(problem, config, generator=problem.generator(0))
-    return ContextAlgorithm(problem, settings, learner=learner)
-
-
 @final
 class FocalLearner(ContextLearner):
     """Encoder and mean."""
 
-    def __init__(self, problem: Problem, config: Config, *, generator: torch.Generator) -> None:
+    def __init__(self, problem: Problem, config: FocalConfig, *, generator: torch.Generator) -> None:
         super().__init__()
         self.latent, self._epsilon = config.latent, config.epsilon
         self.encoder = ContextEncoder(
@@ -68,7 +48,7 @@ class FocalLearner(ContextLearner):
         """The distances of single trajectories' contexts, execution trajectories among them."""
         groups = [self.encoder.read(batch["context"]), self.encoder.read(batch["execution"])]
         representations = torch.cat(self.encoder(*groups), dim=1)
-        mask = torch.cat([each.mask for each in groups], dim=1)
+        mask = torch.cat([group.mask for group in groups], dim=1)
         single = mean_representation(representations.flatten(0, 1), mask.flatten(0, 1))
         distance = losses.distance_metric_loss(single.unflatten(0, mask.shape[:2]), epsilon=self._epsilon)
         num_context = batch["context"].mask.shape[1]
@@ -81,3 +61,27 @@ class FocalLearner(ContextLearner):
     def context(self, steps: Steps) -> Float[Tensor, "lanes latent"]:
         (representations,) = self.encoder(self.encoder.read(steps))
         return mean_representation(representations.flatten(1, 2), steps.mask.flatten(1, 2))
+
+
+@final
+class Focal(Method[FocalConfig]):
+    """The plug-in."""
+
+    name = "focal"
+    Config = FocalConfig
+
+    def batch_request(self, settings: TrainingSettings, config: FocalConfig) -> BatchRequest:
+        """The `[training.batch]` table without windows."""
+        batch = settings.batch
+        return BatchRequest(
+            batch.tasks,
+            {
+                "policy": Transitions(batch.transitions),
+                "context": Trajectories(batch.context_trajectories),
+                "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
+            },
+        )
+
+    def create(self, problem: Problem, settings: TrainingSettings, config: FocalConfig) -> Algorithm:
+        learner = FocalLearner(problem, config, generator=problem.generator(0))
+        return ContextAlgorithm(problem, settings, learner=learner)

@@ -14,27 +14,16 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.methods.problem import Algorithm, Problem
+from tcmrl_algo.methods.base import Algorithm, Capabilities, Method
+from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Transitions
 
-NAME = "no_context"
 
-
-class Config(BaseModel):
+class NoContextConfig(BaseModel):
     """The `[training.no_context]` table: nothing but the shared settings matters."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-def batch_request(settings: TrainingSettings, config: Config) -> BatchRequest:
-    """The actor-critic's transitions: nothing here reads a trajectory."""
-    return BatchRequest(settings.batch.tasks, {"policy": Transitions(settings.batch.transitions)})
-
-
-def create(problem: Problem, settings: TrainingSettings, config: Config) -> Algorithm:
-    """A new learner, its networks at their start."""
-    return ContextAlgorithm(problem, settings, learner=Blind())
 
 
 @final
@@ -49,3 +38,19 @@ class Blind(ContextLearner):
 
     def context(self, steps: Steps) -> Float[Tensor, "lanes latent"]:
         return steps.rewards.new_zeros(len(steps.rewards), 0)
+
+
+@final
+class NoContext(Method[NoContextConfig]):
+    """The plug-in."""
+
+    name = "no_context"
+    Config = NoContextConfig
+    capabilities = Capabilities(blind=True, needs_trajectories=False)
+
+    def batch_request(self, settings: TrainingSettings, config: NoContextConfig) -> BatchRequest:
+        """The actor-critic's transitions: nothing here reads a trajectory."""
+        return BatchRequest(settings.batch.tasks, {"policy": Transitions(settings.batch.transitions)})
+
+    def create(self, problem: Problem, settings: TrainingSettings, config: NoContextConfig) -> Algorithm:
+        return ContextAlgorithm(problem, settings, learner=Blind())

@@ -10,14 +10,13 @@ from torch import Tensor, nn
 from tcmrl_algo.context_methods.encoding import ContextEncoder, EncoderInputs
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.losses import context as losses
-from tcmrl_algo.methods.problem import Algorithm, Metrics, Problem
+from tcmrl_algo.methods.base import Algorithm, Method, Metrics
+from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.networks.attention import Attention, TaskExtractor, uniform_attention
 from tcmrl_algo.networks.perceptron import call_frozen
 from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions, Windows
-
-NAME = "tcmrl"
 
 
 class Weights(BaseModel):
@@ -43,7 +42,7 @@ class Weights(BaseModel):
     orthogonality: float = Field(default=0.0, ge=0)
 
 
-class Config(BaseModel):
+class TcmrlConfig(BaseModel):
     """The `[training.tcmrl]` table. K is `training.batch.window_length`.
 
     Attributes:
@@ -81,31 +80,11 @@ class Config(BaseModel):
     weights: Weights = Weights()
 
 
-def batch_request(settings: TrainingSettings, config: Config) -> BatchRequest:
-    """The `[training.batch]` table as it is."""
-    batch = settings.batch
-    return BatchRequest(
-        tasks=batch.tasks,
-        kinds={
-            "policy": Transitions(batch.transitions),
-            "context": Trajectories(batch.context_trajectories),
-            "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
-            "windows": Windows(batch.windows, batch.window_length),
-        },
-    )
-
-
-def create(problem: Problem, settings: TrainingSettings, config: Config) -> Algorithm:
-    """A new learner, its networks at their start."""
-    learner = TcmrlLearner(problem, settings, config)
-    return ContextAlgorithm(problem, settings, learner=learner)
-
-
 @final
 class TcmrlLearner(ContextLearner):
     """Encoder, extractor, reward estimator and W, and the losses that train them."""
 
-    def __init__(self, problem: Problem, settings: TrainingSettings, config: Config) -> None:
+    def __init__(self, problem: Problem, settings: TrainingSettings, config: TcmrlConfig) -> None:
         super().__init__()
         self.latent, self.config = config.latent, config
         self._horizon, self._window_length = problem.horizon, settings.batch.window_length
@@ -233,3 +212,27 @@ class TcmrlLearner(ContextLearner):
         """FOCAL's loss over the contexts of single trajectories."""
         contexts = self._attend(representations.flatten(0, 1), mask.flatten(0, 1)).context
         return losses.distance_metric_loss(contexts.unflatten(0, mask.shape[:2]))
+
+
+@final
+class Tcmrl(Method[TcmrlConfig]):
+    """The plug-in."""
+
+    name = "tcmrl"
+    Config = TcmrlConfig
+
+    def batch_request(self, settings: TrainingSettings, config: TcmrlConfig) -> BatchRequest:
+        """The `[training.batch]` table as it is."""
+        batch = settings.batch
+        return BatchRequest(
+            batch.tasks,
+            {
+                "policy": Transitions(batch.transitions),
+                "context": Trajectories(batch.context_trajectories),
+                "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
+                "windows": Windows(batch.windows, batch.window_length),
+            },
+        )
+
+    def create(self, problem: Problem, settings: TrainingSettings, config: TcmrlConfig) -> Algorithm:
+        return ContextAlgorithm(problem, settings, learner=TcmrlLearner(problem, settings, config))

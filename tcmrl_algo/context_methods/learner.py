@@ -11,9 +11,12 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from tcmrl_algo.actor_critic.actor_critic import ActorCritic
-from tcmrl_algo.methods.problem import Algorithm, Metrics, Problem, TrainedModules
-from tcmrl_algo.networks.attention import Attention
-from tcmrl_algo.networks.optimizer import Adam
+from tcmrl_algo.context_methods.packing import pack
+from tcmrl_algo.methods.base import Algorithm, Metrics
+from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.stages import StagedOptimizer
+from tcmrl_algo.methods.state import TrainedModules
+from tcmrl_algo.networks.optimizer import Adam, ParameterGroup
 from tcmrl_algo.networks.perceptron import set_hidden_dtype
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, Controller, Steps, Trajectory, UniformController
@@ -28,13 +31,21 @@ class ContextLosses:
 
     Attributes:
         total: what its parameters descend; weighted sum of its terms.
-        context: (tasks, latent), what the actor-critic is conditioned on.
+        context: what the actor-critic is conditioned on, (tasks, latent) or one of every step; None in a
+            stage that does not train the actor-critic.
         metrics: the terms by name.
+        next_context: of the next observations, where it differs from `context`.
+        critic_gradient: lets Q's loss train `context`; V, the policy and all targets see it detached.
+        steps: what the actor-critic learns from; the batch's "policy" transitions if left out. Padding of
+            trajectories (tasks, n, steps) is left out.
     """
 
     total: Float[Tensor, ""]
-    context: Float[Tensor, "tasks latent"]
+    context: Float[Tensor, "tasks *steps latent"] | None
     metrics: Metrics
+    next_context: Float[Tensor, "tasks *steps latent"] | None = None
+    critic_gradient: bool = False
+    steps: Steps | None = None
 
 
 class ContextLearner(nn.Module, abc.ABC):
@@ -48,23 +59,30 @@ class ContextLearner(nn.Module, abc.ABC):
 
     @abc.abstractmethod
     def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
-        """The losses of the batch of a step, and its tasks' contexts; no gradient of others reaches these."""
+        """The losses of the batch of a step, and its tasks' contexts."""
 
     @abc.abstractmethod
     def context(self, steps: Steps) -> Float[Tensor, "lanes latent"]:
         """One context per lane, of all its trajectories together: (lanes, trajectories, steps)."""
 
-    def attention(self, steps: Steps) -> Attention | None:
-        """How the steps of each lane weigh in its context; None for a method without attention."""
-        return None
-
     def explore(self, actor_critic: ActorCritic, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         """As `Algorithm.explore`, for a method that collects its first episodes with its policy."""
         return UniformController()
 
+    def parts(self, stage: str) -> Sequence[str]:
+        """Names of the modules and parameters here that a stage trains; everything unless overridden."""
+        return ("",)
+
+    def groups(self) -> Mapping[str, ParameterGroup]:
+        """Learning rates and bounds of their own, by the name of a module or parameter here."""
+        return {}
+
     def optimizers(self) -> Mapping[str, Adam]:
         """Optimisers that the learner steps itself within `losses`, by name; none unless overridden."""
         return {}
+
+    def after_step(self, step: int) -> None:
+        """Moves what no optimiser trains, such as momentum copies; does nothing unless overridden."""
 
 
 @final
@@ -88,26 +106,39 @@ class ContextAlgorithm(Algorithm):
         ).to(problem.device)
         everything = nn.ModuleDict({"context": self.learner, "actor_critic": self.actor_critic})
         set_hidden_dtype(everything, getattr(torch, settings.run.precision))
-        table = settings.optimizer
-        self._adam = Adam(
+        self._optimizer = StagedOptimizer(
             everything,
-            learning_rate=table.learning_rate,
-            final_share=table.final_share,
-            decay_steps=problem.steps,
-            gradient_norm=table.gradient_norm,
+            problem.stages,
+            settings.optimizer,
+            parts={
+                stage.name: ("actor_critic", *map(_in_everything, learner.parts(stage.name)))
+                for stage in problem.stages
+            },
+            groups={_in_everything(name): group for name, group in learner.groups().items()},
         )
-        own = {**self.learner.optimizers(), **self.actor_critic.optimizers()}
-        self._trained = TrainedModules({"all": everything}, {"all": self._adam, **own})
+        own = {**learner.optimizers(), **self.actor_critic.optimizers()}
+        self._trained = TrainedModules({"all": everything}, {**self._optimizer.adams, **own})
 
     def update(self, batch: Batch, step: int) -> Metrics:
+        self._optimizer.begin(step)
         found = self.learner.losses(batch, step, self._problem.generator(step))
-        generator = self._problem.generator(step, ACTOR_CRITIC_STREAM)
-        rows = self.actor_critic.rows(batch["policy"], found.context)
-        self.actor_critic.train_dual(rows, generator)
-        loss, metrics = self.actor_critic.losses(rows, generator)
-        self._adam.step(found.total + loss, steps_done=step - 1)
-        self.actor_critic.after_step()
-        return {name: each.detach() for name, each in (found.metrics | metrics).items()}
+        loss, metrics = found.total, found.metrics
+        if found.context is not None:
+            generator = self._problem.generator(step, ACTOR_CRITIC_STREAM)
+            rows = self.actor_critic.rows(
+                batch["policy"] if found.steps is None else found.steps,
+                found.context,
+                found.next_context,
+                critic_gradient=found.critic_gradient,
+            )
+            self.actor_critic.train_dual(rows, generator)
+            actor_critic_loss, more = self.actor_critic.losses(rows, generator)
+            loss, metrics = loss + actor_critic_loss, metrics | more
+        self._optimizer.step(loss, step)
+        self.learner.after_step(step)
+        if found.context is not None:
+            self.actor_critic.after_step()
+        return {name: value.detach() for name, value in metrics.items()}
 
     def limits(self) -> Mapping[str, float]:
         return self.actor_critic.limits()
@@ -115,24 +146,30 @@ class ContextAlgorithm(Algorithm):
     def explore(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         return self.learner.explore(self.actor_critic, trajectories)
 
-    def adapt(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
+    def adapt(
+        self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
+    ) -> Controller:
         return ContextController(self.actor_critic, self.context(trajectories))
 
     def context(self, trajectories: Sequence[Sequence[Trajectory]]) -> Float[Tensor, "lanes latent"]:
-        """One context per lane, of all its trajectories together; at least one trajectory each."""
+        """One context per lane, of all its trajectories together."""
         with torch.no_grad():
-            return self.learner.context(pack(trajectories, self._problem.device))
+            return self.learner.context(self.pack(trajectories))
 
-    def attention(self, trajectories: Sequence[Sequence[Trajectory]]) -> Attention | None:
-        """How the steps of each lane weigh in its context, trajectory after trajectory, padding included."""
-        with torch.no_grad():
-            return self.learner.attention(pack(trajectories, self._problem.device))
+    def pack(self, trajectories: Sequence[Sequence[Trajectory]]) -> Steps:
+        """The trajectories of every lane as the learner reads them, on its device."""
+        return pack(trajectories, self._problem)
 
     def tensors(self) -> dict[str, Tensor]:
         return self._trained.tensors()
 
     def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
         self._trained.load_tensors(tensors)
+
+
+def _in_everything(name: str) -> str:
+    """The name of a learner's part in the module that holds the actor-critic too."""
+    return f"context.{name}" if name else "context"
 
 
 @final
@@ -148,28 +185,3 @@ class ContextController(Controller):
         states = torch.as_tensor(observations, dtype=torch.float32, device=self._context.device)
         actions: np.typing.NDArray[np.floating] = self._actor_critic.act(states, self._context).cpu().numpy()
         return actions
-
-
-def pack(trajectories: Sequence[Sequence[Trajectory]], device: torch.device) -> Steps:
-    """Trajectories of several lanes as padded steps (lanes, most trajectories, longest episode).
-
-    Lanes may hold different numbers of trajectories; what is missing is padding.
-    """
-    shape = (
-        len(trajectories),
-        max(len(lane) for lane in trajectories),
-        max(len(each) for lane in trajectories for each in lane),
-    )
-    first = trajectories[0][0]
-    observations, following = np.zeros((2, *shape, first.observations.shape[1]), dtype=np.float32)
-    actions = np.zeros((*shape, first.actions.shape[1]), dtype=np.float32)
-    rewards, terminated = np.zeros((2, *shape), dtype=np.float32)
-    mask = np.zeros(shape, dtype=bool)
-    for i, lane in enumerate(trajectories):
-        for j, each in enumerate(lane):
-            place = (i, j, slice(0, len(each)))
-            observations[place], following[place] = each.observations[:-1], each.observations[1:]
-            actions[place], rewards[place] = each.actions, each.rewards
-            terminated[place], mask[place] = each.terminated, True
-    arrays = (observations, actions, rewards, following, terminated, mask)
-    return Steps(*(torch.from_numpy(each).to(device) for each in arrays))

@@ -1,31 +1,17 @@
-"""What a method learns from (`Problem`), and what every method is (`Algorithm`)."""
+"""What a method learns from: sizes and statistics of the data, stages, tasks, and the seed."""
 
-import abc
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, final
+from typing import Literal
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from pydantic import BaseModel, ConfigDict
-from torch import Tensor, nn
+from torch import Tensor
 
-from tcmrl_algo.networks.optimizer import Adam
-from tcmrl_data import (
-    NO_TASK,
-    Batch,
-    Controller,
-    Environment,
-    Moments,
-    Purpose,
-    Trajectory,
-    UniformController,
-    keyed_seed,
-)
-
-Metrics = dict[str, Tensor]
-"""Scalars of one training step, by flat names such as `loss/reward`."""
+from tcmrl_algo.methods.stages import StagePlan
+from tcmrl_data import NO_TASK, Environment, Moments, Purpose, keyed_seed
 
 
 @dataclass(frozen=True)
@@ -42,7 +28,10 @@ class Problem:
         reward_mean, reward_std: of single steps.
         reward_range: lowest and highest reward of a step.
         seed: the run's.
-        steps: training steps over which schedules stretch.
+        stages: of training; schedules stretch over them.
+        training_tasks: indices of the training tasks, ascending.
+        privileged: (training tasks, parameters), standardised task parameters in the order of
+            `training_tasks`; None for methods without that capability.
         device: where networks live.
     """
 
@@ -61,8 +50,15 @@ class Problem:
     reward_std: float
     reward_range: tuple[float, float]
     seed: int
-    steps: int
+    stages: StagePlan
+    training_tasks: tuple[int, ...]
+    privileged: Float[Tensor, "training_tasks parameters"] | None
     device: torch.device
+
+    def position(self, task_indices: Int64[Tensor, " tasks"]) -> Int64[Tensor, " tasks"]:
+        """Dense indices, from 0, of training tasks given by the indices that batches hold."""
+        known = torch.tensor(self.training_tasks, device=task_indices.device)
+        return torch.searchsorted(known, task_indices)
 
     def generator(self, step: int, stream: int = 0) -> torch.Generator:
         """The CPU generator of one training step (0: the networks' starts), a function of seed and step.
@@ -99,9 +95,16 @@ class MomentsRecord(BaseModel):
 
 
 def problem_of(
-    environment: Environment, moments: MomentsRecord, *, seed: int, steps: int, device: torch.device
+    environment: Environment,
+    moments: MomentsRecord,
+    *,
+    seed: int,
+    stages: StagePlan,
+    training_tasks: Sequence[int],
+    privileged: Float[Tensor, "training_tasks parameters"] | None,
+    device: torch.device,
 ) -> Problem:
-    """The problem that an environment and the statistics of the selected data pose."""
+    """The problem that an environment, its training tasks and the statistics of the selected data pose."""
     return Problem(
         environment=environment.name,
         observation_dim=environment.observation_dim,
@@ -118,72 +121,8 @@ def problem_of(
         reward_std=moments.reward_std,
         reward_range=(moments.reward_min, moments.reward_max),
         seed=seed,
-        steps=steps,
+        stages=stages,
+        training_tasks=tuple(sorted(training_tasks)),
+        privileged=None if privileged is None else privileged.to(device),
         device=device,
     )
-
-
-class Algorithm(abc.ABC):
-    """A meta-learner: trained on batches, then adapted to a task by that task's trajectories.
-
-    A method is one file in `tcmrl_algo/algorithms` with NAME, a frozen `Config` (its own table of a
-    recipe's `[training]`), `batch_request(settings, config)`, what its batches hold, and
-    `create(problem, settings, config) -> Algorithm`. Training, checkpoints and
-    evaluation know no more of it than this class.
-    """
-
-    @abc.abstractmethod
-    def update(self, batch: Batch, step: int) -> Metrics:
-        """One training step, a function of the current tensors, the batch and the step's number (from 1)."""
-
-    def limits(self) -> Mapping[str, float]:
-        """Size beyond which a metric says that learning diverges, for some of them; training stops there."""
-        return {}
-
-    @abc.abstractmethod
-    def adapt(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
-        """A controller without exploration; lane i is adapted to the task that `trajectories[i]` show."""
-
-    def explore(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
-        """Acts in the first stage of the protocol `paper`; uniformly, unless a method collects otherwise.
-
-        Args:
-            trajectories: what lane i has collected so far; nothing at first.
-        """
-        return UniformController()
-
-    @abc.abstractmethod
-    def tensors(self) -> dict[str, Tensor]:
-        """Everything that training changes: parameters, buffers, optimiser state, by name."""
-
-    @abc.abstractmethod
-    def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
-        """Takes over what `tensors` returned, for evaluation or for going on with training."""
-
-
-@final
-class TrainedModules:
-    """Modules and their optimisers as one flat set of named tensors, for `Algorithm.tensors`."""
-
-    def __init__(self, modules: Mapping[str, nn.Module], optimizers: Mapping[str, Adam]) -> None:
-        self._modules, self._optimizers = modules, optimizers
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Detached tensors, named `module/…` and `optimizer/…`."""
-        found: dict[str, Any] = {}
-        for name, module in self._modules.items():
-            found.update({f"module/{name}/{key}": value for key, value in module.state_dict().items()})
-        for name, optimizer in self._optimizers.items():
-            found.update({f"optimizer/{name}/{key}": value for key, value in optimizer.tensors().items()})
-        return {name: value.detach() for name, value in found.items()}
-
-    def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
-        """Takes over what `tensors` returned."""
-        for name, module in self._modules.items():
-            module.load_state_dict(_below(tensors, f"module/{name}/"))
-        for name, optimizer in self._optimizers.items():
-            optimizer.load_tensors(_below(tensors, f"optimizer/{name}/"))
-
-
-def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    return {name.removeprefix(prefix): each for name, each in tensors.items() if name.startswith(prefix)}

@@ -1,6 +1,7 @@
 """Adam with a linear decay, whose whole state is named tensors."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from typing import final
 
 import torch
@@ -9,40 +10,71 @@ from torch import Tensor, nn
 MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
+@dataclass(frozen=True)
+class ParameterGroup:
+    """How some parameters learn, where they differ from the others.
+
+    Attributes:
+        learning_rate: at the first step; it decays as that of the others does.
+        gradient_norm: bound of the norm of these parameters' gradient; None for none.
+    """
+
+    learning_rate: float
+    gradient_norm: float | None = None
+
+
 @final
 class Adam:
-    """Adam over a module's trainable parameters.
+    """Adam over named parameters.
 
     Args:
-        module: what to train.
+        parameters: as of `Module.named_parameters`; those without a gradient are left out.
         learning_rate: at the first step.
-        final_share: share of it that is left after `decay_steps`; it falls linearly and stays there.
+        final_share: share of it at and after `decay_steps`; the rate falls linearly until then.
         decay_steps: length of the decay.
         gradient_norm: gradients above this norm are scaled down to it; None leaves them.
+        groups: rates and bounds of their own, by the name of a parameter or of a module above it. The longest
+            name that fits decides. The bound above counts the parameters of no group alone.
+
+    Raises:
+        ValueError: there is no parameter to train, or a group without one.
     """
 
     def __init__(
         self,
-        module: nn.Module,
+        parameters: Iterable[tuple[str, nn.Parameter]],
         *,
         learning_rate: float,
         final_share: float = 1.0,
         decay_steps: int = 1,
         gradient_norm: float | None = None,
+        groups: Mapping[str, ParameterGroup] | None = None,
     ) -> None:
-        self._parameters = {name: each for name, each in module.named_parameters() if each.requires_grad}
-        self._learning_rate, self._final_share = learning_rate, final_share
-        self._decay_steps, self._gradient_norm = decay_steps, gradient_norm
-        self._adam = torch.optim.Adam(self._parameters.values(), lr=learning_rate, fused=True)
+        self._parameters = {name: value for name, value in parameters if value.requires_grad}
+        self._final_share, self._decay_steps = final_share, decay_steps
+        settings = {"": ParameterGroup(learning_rate, gradient_norm), **(groups or {})}
+        members: dict[str, list[nn.Parameter]] = {prefix: [] for prefix in settings}
+        for name, parameter in self._parameters.items():
+            members[max((prefix for prefix in settings if is_below(name, prefix)), key=len)].append(parameter)
+        for prefix, group in members.items():
+            if prefix and not group:
+                raise ValueError(f"no parameter to train is named {prefix!r} or lies below it")
+        self._groups = [(settings[prefix], group) for prefix, group in members.items() if group]
+        self._adam = torch.optim.Adam(
+            [{"params": group, "lr": own.learning_rate} for own, group in self._groups], fused=True
+        )
 
     def step(self, loss: Tensor, *, steps_done: int = 0) -> None:
-        """One descent step of `loss`; the learning rate is a function of `steps_done` alone."""
+        """One descent step of `loss`; the learning rates are a function of `steps_done` alone."""
         progress = min(steps_done / self._decay_steps, 1.0)
-        self._adam.param_groups[0]["lr"] = self._learning_rate * (1.0 - (1.0 - self._final_share) * progress)
+        share = 1.0 - (1.0 - self._final_share) * progress
+        for values, (own, _) in zip(self._adam.param_groups, self._groups, strict=True):
+            values["lr"] = own.learning_rate * share
         self._adam.zero_grad(set_to_none=True)
         loss.backward()
-        if self._gradient_norm is not None:
-            nn.utils.clip_grad_norm_(self._parameters.values(), self._gradient_norm)
+        for own, group in self._groups:
+            if own.gradient_norm is not None:
+                nn.utils.clip_grad_norm_(group, own.gradient_norm)
         self._adam.step()
 
     def tensors(self) -> dict[str, Tensor]:
@@ -61,3 +93,8 @@ class Adam:
                 self._adam.state[parameter] = {
                     moment: tensors[f"{name}/{moment}"].to(parameter.device, copy=True) for moment in MOMENTS
                 }
+
+
+def is_below(name: str, prefix: str) -> bool:
+    """Whether a parameter has a name or lies below the module of that name; "" is above all."""
+    return not prefix or name == prefix or name.startswith(f"{prefix}.")

@@ -9,6 +9,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
+from tcmrl_algo.context_methods.attention import attention_of
 from tcmrl_algo.context_methods.learner import ContextAlgorithm
 from tcmrl_algo.reporting.sources import FinishedRun
 from tcmrl_algo.training.checkpoint import open_run
@@ -100,9 +101,7 @@ class TrainedContexts:
     @cached_property
     def weights(self) -> TransitionWeights | None:
         """None for a method without attention."""
-        if not isinstance(self._algorithm, ContextAlgorithm):
-            return None
-        attention = self._algorithm.attention(self._stored.lanes)
+        attention = attention_of(self._algorithm, self._stored.lanes)
         if attention is None:
             return None
         rows = [

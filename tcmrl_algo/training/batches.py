@@ -5,6 +5,7 @@ from typing import Protocol, final, runtime_checkable
 
 import torch
 
+from tcmrl_algo.methods.stages import StagePlan
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_data import Batch, BatchRequest, Dataset, Moments, Sampler, Transitions, open_sampler
 
@@ -33,19 +34,19 @@ class Batches(Protocol):
 def open_batches(
     dataset: Dataset,
     run: RunSettings,
-    request: BatchRequest,
+    stages: StagePlan,
     *,
     seed: int,
     device: torch.device,
     memory_limit: int | None,
     say: Callable[[str], None],
-) -> Batches:
-    """The stream of batches from the training tasks.
+) -> "StagedBatches":
+    """The stream of batches from the training tasks; the steps of the selections are loaded once.
 
     Args:
         dataset: what to learn from.
         run: `snapshots` and `context_snapshots` say which.
-        request: what a batch holds.
+        stages: what the batches of every stage hold.
         seed: of the run.
         device: where batches are to be.
         memory_limit: as for `train_run`.
@@ -58,10 +59,13 @@ def open_batches(
             selection, request, seed=seed, device=str(device), memory_limit=memory_limit, say=say
         )
 
-    transitions = only_transitions(request)
-    if run.context_snapshots is None or transitions == request:
-        return sampler(run.snapshots, request)
-    return JoinedBatches(sampler(run.snapshots, transitions), sampler(run.context_snapshots, request))
+    requests = [stage.request for stage in stages]
+    first, transitions = requests[0], only_transitions(requests[0])
+    reads_contexts = any(request != only_transitions(request) for request in requests)
+    if run.context_snapshots is None or not reads_contexts:
+        return StagedBatches(sampler(run.snapshots, first), stages)
+    contexts = sampler(run.context_snapshots, first)
+    return StagedBatches(JoinedBatches(sampler(run.snapshots, transitions), contexts), stages)
 
 
 def only_transitions(request: BatchRequest) -> BatchRequest:
@@ -101,3 +105,29 @@ class JoinedBatches:
     def short_trajectories(self, length: int) -> int:
         """How many of the contexts' trajectories are shorter than `length`."""
         return self._contexts.short_trajectories(length)
+
+
+@final
+class StagedBatches:
+    """The batches of a run: batch n is for training step n + 1, and holds what that step's stage requests.
+
+    Args:
+        batches: of the first stage.
+        stages: all of them.
+    """
+
+    def __init__(self, batches: Batches, stages: StagePlan) -> None:
+        self._batches, self._stages = batches, stages
+        self._by_stage = {stage.name: batches.with_request(stage.request) for stage in stages}
+
+    def batch(self, n: int) -> Batch:
+        """The n-th batch, n >= 0."""
+        return self._by_stage[self._stages.at(n + 1).stage].batch(n)
+
+    def moments(self) -> Moments:
+        """Statistics over all transitions that the actor-critic may see."""
+        return self._batches.moments()
+
+    def short_trajectories(self, length: int) -> int:
+        """How many trajectories hold no window of `length` steps."""
+        return self._batches.short_trajectories(length)

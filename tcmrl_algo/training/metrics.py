@@ -47,9 +47,9 @@ class MetricsWriter:
         self._stream = self._file.open("a", encoding="utf-8")
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
 
-    def write(self, step: int, metrics: Mapping[str, float]) -> None:
-        """Logs the metrics of a step."""
-        self._stream.write(json.dumps({"step": step, **metrics}) + "\n")
+    def write(self, step: int, metrics: Mapping[str, float], *, stage: str) -> None:
+        """Logs the metrics of a step of a stage."""
+        self._stream.write(json.dumps({"step": step, "stage": stage, **metrics}) + "\n")
         self._stream.flush()
         for name, value in metrics.items():
             self._board.add_scalar(name, value, step)

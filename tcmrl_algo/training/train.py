@@ -7,21 +7,20 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 
 import torch
-from pydantic import BaseModel
 from torch import Tensor
 
-from tcmrl_algo.methods.problem import Algorithm, MomentsRecord, problem_of
-from tcmrl_algo.training.batches import Batches, open_batches
+from tcmrl_algo.methods.base import Algorithm
+from tcmrl_algo.methods.privileged import TaskParameters
+from tcmrl_algo.methods.problem import MomentsRecord, problem_of
+from tcmrl_algo.training.batches import StagedBatches, open_batches
 from tcmrl_algo.training.checkpoint import Run, RunRecord, digest, open_run, write_run
-from tcmrl_algo.training.config import ALGORITHMS, TrainingConfig
+from tcmrl_algo.training.config import TrainingConfig, method_of, stage_plan
 from tcmrl_algo.training.interruption import DeferredInterrupts
 from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_algo.training.metrics import MetricsWriter
-from tcmrl_data import BatchRequest, CheckpointError, Dataset, Prefetch, TrainingError, plugin
-from tcmrl_data.foundation.validation import validate_table
+from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError
 
 PACKAGES = ("torch", "numpy")
 """Whose versions results depend on."""
@@ -42,6 +41,7 @@ class Progress:
     Attributes:
         step: steps done.
         steps: steps to do.
+        stage: of training, to which the step belongs.
         rate: steps per second since the last report.
         data_share: share of that time spent waiting for batches.
         metrics: of that step.
@@ -49,6 +49,7 @@ class Progress:
 
     step: int
     steps: int
+    stage: str
     rate: float
     data_share: float
     metrics: Mapping[str, float]
@@ -123,7 +124,7 @@ def train_run(
     batches = open_batches(
         dataset,
         config.settings.run,
-        batch_request(config),
+        stage_plan(config),
         seed=seed,
         device=usable_device(device),
         memory_limit=memory_limit,
@@ -183,7 +184,7 @@ def resume_run(
     batches = open_batches(
         dataset,
         record.config.settings.run,
-        batch_request(record.config),
+        stage_plan(record.config),
         seed=record.seed,
         device=usable_device(record.device),
         memory_limit=memory_limit,
@@ -196,20 +197,6 @@ def resume_run(
     return _train(write_run(run.folder, record), algorithm, batches, start=start, report=report)
 
 
-def batch_request(config: TrainingConfig) -> BatchRequest:
-    """What a run's method reads of a batch."""
-    module = plugin(ALGORITHMS, "algorithm", config.settings.run.algorithm)
-    request: BatchRequest = module.batch_request(config.settings, _method_table(module, config))
-    return request
-
-
-def _method_table(module: ModuleType, config: TrainingConfig) -> BaseModel:
-    table: BaseModel = validate_table(
-        module.Config, config.method, place="run.json", error=TrainingError, table="config.method"
-    )
-    return table
-
-
 def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
     """A run's algorithm with its networks at their start, for training or for a checkpoint's tensors.
 
@@ -218,16 +205,19 @@ def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
     """
     settings = record.config.settings
     torch.set_num_threads(settings.run.threads)
+    method, config = method_of(record.config)
+    training_tasks = dataset.train_tasks
+    privileged = TaskParameters(training_tasks) if method.capabilities.privileged else None
     problem = problem_of(
         dataset.environment,
         record.moments,
         seed=record.seed,
-        steps=settings.run.steps,
+        stages=stage_plan(record.config),
+        training_tasks=[task.index for task in training_tasks],
+        privileged=privileged(training_tasks) if privileged else None,
         device=usable_device(record.device),
     )
-    module = plugin(ALGORITHMS, "algorithm", settings.run.algorithm)
-    algorithm: Algorithm = module.create(problem, settings, _method_table(module, record.config))
-    return algorithm
+    return method.create(problem, settings, config)
 
 
 def usable_device(name: str) -> torch.device:
@@ -248,14 +238,14 @@ def usable_device(name: str) -> torch.device:
 def _train(
     run: Run,
     algorithm: Algorithm,
-    batches: Batches,
+    batches: StagedBatches,
     *,
     start: int,
     report: Callable[[Progress], None],
 ) -> TrainingReport:
     """The loop: batch n - 1 makes step n; Ctrl-C and SIGTERM take effect after a checkpoint of their step."""
     settings, last = run.record.config.settings.run, run.record.steps
-    window_length = run.record.config.settings.batch.window_length
+    stages, window_length = stage_plan(run.record.config), run.record.config.settings.batch.window_length
     keep_freed_memory()
     began = time.perf_counter()
     logged_at, logged_step, logged_wait = began, start, 0.0
@@ -275,8 +265,9 @@ def _train(
                 logged_at, logged_step, logged_wait = now, step, stream.waited
                 about = {"data/short_trajectories": float(batches.short_trajectories(window_length))}
                 times = {"time/steps_per_second": rate, "time/data_share": share}
-                writer.write(step, values | about | times)
-                report(Progress(step, last, rate, share, values))
+                stage = stages.at(step).stage
+                writer.write(step, values | about | times, stage=stage)
+                report(Progress(step, last, stage, rate, share, values))
             stopping = interrupts.received
             if step % settings.checkpoint_every == 0 or step == last or stopping:
                 _check_finite(algorithm.tensors(), step)

@@ -1,0 +1,125 @@
+"""What a method is: a plug-in (`Method`) that makes a learner (`Algorithm`) for a problem."""
+
+import abc
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, TypeVar
+
+from pydantic import BaseModel
+from torch import Tensor
+
+from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.stages import Stage
+from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_data import Batch, BatchRequest, Controller, Trajectory, UniformController
+from tcmrl_data.foundation.plugins import Registry
+
+ConfigT = TypeVar("ConfigT", bound=BaseModel)
+Metrics = dict[str, Tensor]
+"""Scalars of one training step, by flat names such as `loss/reward`."""
+
+
+@dataclass(frozen=True)
+class Capabilities:
+    """What evaluation and the conformance tests may expect of a method.
+
+    Attributes:
+        blind: trajectories do not change how it acts.
+        explores: it collects its first episodes in its own way instead of uniformly.
+        stateful: its controllers adapt within an episode.
+        privileged: it may see task parameters, as a control; every record of its runs says so.
+        needs_trajectories: it cannot adapt to no trajectory at all.
+    """
+
+    blind: bool = False
+    explores: bool = False
+    stateful: bool = False
+    privileged: bool = False
+    needs_trajectories: bool = True
+
+
+class Algorithm(abc.ABC):
+    """A meta-learner: trained on batches, then adapted to a task by trajectories of that task.
+
+    Training, checkpoints and evaluation know no more of a method than this class and its `Method`.
+    """
+
+    @abc.abstractmethod
+    def update(self, batch: Batch, step: int) -> Metrics:
+        """One training step, a function of the current tensors, the batch and the step's number.
+
+        Args:
+            batch: holds what the step's stage requested.
+            step: counted from 1 over all stages; `Problem.stages` tells the stage.
+        """
+
+    def limits(self) -> Mapping[str, float]:
+        """Size beyond which a metric says that learning diverges, for some of them; training stops there."""
+        return {}
+
+    @abc.abstractmethod
+    def adapt(
+        self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
+    ) -> Controller:
+        """A controller without exploration; lane i is adapted to the task that `trajectories[i]` show.
+
+        Args:
+            trajectories: at least one per lane, unless `Capabilities.needs_trajectories` is False.
+            privileged: (lanes, parameters) standardised task parameters; None for methods without that
+                capability.
+        """
+
+    def explore(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
+        """Acts in the first stage of the protocol `paper`; uniformly, unless a method collects otherwise.
+
+        Args:
+            trajectories: what lane i has collected so far; nothing at first.
+        """
+        return UniformController()
+
+    @abc.abstractmethod
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything that training changes: parameters, buffers, optimiser state, by name."""
+
+    @abc.abstractmethod
+    def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
+        """Takes over what `tensors` returned, for evaluation or for going on with training."""
+
+
+class Method(abc.ABC, Generic[ConfigT]):
+    """A method as a plug-in: stateless, and made without arguments.
+
+    A package declares it as an entry point of the group `tcmrl.algorithms`, under `name`.
+
+    Attributes:
+        name: as `--algo` and a recipe's `[training.<name>]` table spell it.
+        Config: the method's own settings, a frozen pydantic model whose docstring documents every field.
+        capabilities: what evaluation may expect.
+
+    Example:
+        >>> METHODS.get("focal").name
+        'focal'
+    """
+
+    name: ClassVar[str]
+    Config: ClassVar[type[BaseModel]]
+    capabilities: ClassVar[Capabilities] = Capabilities()
+
+    @abc.abstractmethod
+    def batch_request(self, settings: TrainingSettings, config: ConfigT) -> BatchRequest:
+        """What a batch holds in training; with several stages, in the last one."""
+
+    def stages(self, settings: TrainingSettings, config: ConfigT) -> tuple[Stage, ...]:
+        """The stages of training, whose steps sum to `settings.run.steps`; one, unless overridden."""
+        return (Stage("train", settings.run.steps, self.batch_request(settings, config)),)
+
+    @abc.abstractmethod
+    def create(self, problem: Problem, settings: TrainingSettings, config: ConfigT) -> Algorithm:
+        """A new learner, its networks at their start."""
+
+
+METHODS: Registry[Method[Any]] = Registry(
+    "tcmrl.algorithms",
+    "algorithm",
+    Method,
+)

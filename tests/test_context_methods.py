@@ -1,0 +1,187 @@
+"""Methods that adapt through a context: packing, what learners may do, and what FOCAL and the control are."""
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+from tcmrl_algo.actor_critic.actor_critic import ActorCritic
+from tcmrl_algo.algorithms import focal, no_context, tcmrl
+from tcmrl_algo.context_methods.attention import attention_of
+from tcmrl_algo.context_methods.learner import (
+    ContextAlgorithm,
+    ContextController,
+    ContextLearner,
+    ContextLosses,
+)
+from tcmrl_algo.context_methods.packing import pack
+from tcmrl_algo.losses import context as losses
+from tcmrl_algo.networks.momentum import follow, momentum_copy
+from tcmrl_algo.networks.optimizer import Adam, ParameterGroup
+from tcmrl_data import Batch, BatchRequest, Controller, Steps, Transitions
+from tests.made_up import TASKS, batch, problem, settings, trajectory, with_steps
+
+
+def test_every_step_has_its_own_generator() -> None:
+    places = [(1, 0), (2, 0), (1, 1), (1, 0)]
+    draws = [torch.rand(3, generator=problem().generator(*each)) for each in places]
+    assert torch.equal(draws[0], draws[3])
+    assert not torch.equal(draws[0], draws[1])
+    assert not torch.equal(draws[0], draws[2])
+    assert not torch.equal(torch.rand(3, generator=problem(seed=1).generator(1)), draws[0])
+
+
+def test_packed_trajectories_keep_their_steps_and_mask_the_rest() -> None:
+    lanes = [[trajectory(6, 0)], [trajectory(4, 1), trajectory(2, 2)]]
+    packed = pack(lanes, problem())
+    assert packed.mask.sum(dim=-1).tolist() == [[6, 0], [4, 2]]
+    expected = torch.from_numpy(lanes[1][1].observations[1:])
+    torch.testing.assert_close(packed.next_observations[1, 1, :2], expected)
+
+
+def test_no_context_needs_no_trajectories() -> None:
+    request = no_context.NoContext().batch_request(settings(), no_context.NoContextConfig())
+    assert request == BatchRequest(TASKS, {"policy": Transitions(5)})
+
+
+def focal_learner() -> ContextLearner:
+    made = focal.Focal().create(problem(), settings(), focal.FocalConfig(latent=4, encoder_hidden=(8,)))
+    assert isinstance(made, ContextAlgorithm)
+    return made.learner
+
+
+def test_focal_pulls_the_means_of_a_tasks_trajectories_together() -> None:
+    made, values = focal_learner(), batch()
+    assert isinstance(made, focal.FocalLearner)
+    found = made.losses(values, 1, torch.Generator())
+    groups = (made.encoder.read(values["context"]), made.encoder.read(values["execution"]))
+    context, execution = made.encoder(*groups)
+    single = torch.stack(
+        [
+            torch.stack([each[mask].mean(dim=0) for each, mask in zip(lane, real, strict=True)])
+            for lane, real in zip(
+                torch.cat([context, execution], dim=1),
+                torch.cat([each.mask for each in groups], dim=1),
+                strict=True,
+            )
+        ]
+    )
+    torch.testing.assert_close(found.total, losses.distance_metric_loss(single, epsilon=0.1))
+    for lane, values_of in enumerate(context):
+        torch.testing.assert_close(found.context[lane], values_of[groups[0].mask[lane]].mean(dim=0))
+
+
+def test_focal_gathers_each_tasks_contexts() -> None:
+    """The measured ratio of distances within and between tasks falls as it trains."""
+    made = focal.Focal().create(problem(), settings(), focal.FocalConfig(latent=4, encoder_hidden=(16,)))
+    assert isinstance(made, ContextAlgorithm)
+
+    def shifted(values: Steps) -> Steps:
+        offset = torch.arange(TASKS).view(TASKS, 1, 1) - 1.0
+        return replace(values, rewards=values.rewards + offset)  # tasks differ in their reward
+
+    values = batch(lengths=None)
+    values = with_steps(values, context=shifted(values["context"]), execution=shifted(values["execution"]))
+
+    def ratio() -> float:
+        parts = (values["context"], values["execution"])
+        contexts = torch.stack([made.learner.context(each) for each in parts]).detach()
+        within = (contexts[0] - contexts[1]).norm(dim=-1).mean()
+        between = (contexts[0].roll(1, 0) - contexts[1]).norm(dim=-1).mean()
+        return float(within / between)
+
+    before = ratio()
+    for step in range(1, 60):
+        made.update(values, step)
+    assert ratio() < 0.5 * before
+
+
+def test_a_learner_may_collect_and_optimise_in_its_own_way() -> None:
+    """What CSRO needs: a network trained within `losses`, kept in checkpoints, and its own first episodes."""
+
+    class Own(ContextLearner):
+        latent = 0
+
+        def __init__(self) -> None:
+            super().__init__()
+            self.inner = torch.nn.Linear(1, 1)
+            self.adam = Adam(self.inner.named_parameters(), learning_rate=0.1)
+
+        def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
+            self.adam.step(self.inner.weight.sum())
+            zero = batch["policy"].rewards.new_zeros(())
+            return ContextLosses(zero, zero.new_zeros(TASKS, 0), {})
+
+        def context(self, steps: Steps) -> torch.Tensor:
+            return steps.rewards.new_zeros(len(steps.rewards), 0)
+
+        def optimizers(self) -> dict[str, Adam]:
+            return {"inner": self.adam}
+
+        def explore(self, actor_critic: ActorCritic, trajectories: Any) -> Controller:
+            return ContextController(actor_critic, torch.zeros(len(trajectories), 0))
+
+    method = ContextAlgorithm(problem(), settings(), learner=Own())
+    before = method.learner.inner.weight.item()
+    method.update(batch(), 1)
+    assert method.learner.inner.weight.item() == pytest.approx(before - 0.1)  # one step of its own alone
+    assert "optimizer/inner/weight/step" in method.tensors()
+    assert isinstance(method.explore([[], []]), ContextController)
+
+
+class Momentum(ContextLearner):
+    """Contexts that the critic alone trains, beside a momentum copy of what makes them."""
+
+    latent = 2
+
+    def __init__(self, *, stepwise: bool = False, critic_gradient: bool = True) -> None:
+        super().__init__()
+        self.query = torch.nn.Linear(1, 2)
+        self.key = momentum_copy(self.query)
+        self.stepwise, self.critic_gradient = stepwise, critic_gradient
+
+    def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
+        steps = batch["context"] if self.stepwise else batch["policy"]
+        contexts = self.query(steps.rewards.unsqueeze(-1))
+        zero = contexts.new_zeros(())
+        if self.stepwise:
+            following = contexts + 1.0
+            return ContextLosses(zero, contexts, {}, following, self.critic_gradient, steps)
+        return ContextLosses(zero, contexts.mean(dim=1), {}, critic_gradient=self.critic_gradient)
+
+    def context(self, steps: Steps) -> torch.Tensor:
+        return self.query(steps.rewards.unsqueeze(-1)).mean(dim=(1, 2))
+
+    def after_step(self, step: int) -> None:
+        follow(self.key, self.query, step=0.5)
+
+    def groups(self) -> dict[str, ParameterGroup]:
+        return {"query": ParameterGroup(learning_rate=0.5)}
+
+
+@pytest.mark.parametrize("stepwise", [False, True])
+@pytest.mark.parametrize("critic_gradient", [False, True])
+def test_contexts_may_be_trained_by_the_critic_step_by_step_with_a_rate_of_their_own(
+    stepwise: bool, critic_gradient: bool
+) -> None:
+    """What CORRO, PEARL and BOReL need."""
+    method = ContextAlgorithm(
+        problem(), settings(), learner=Momentum(stepwise=stepwise, critic_gradient=critic_gradient)
+    )
+    before = {name: value.clone() for name, value in method.learner.state_dict().items()}
+    method.update(batch(), 1)
+    after = method.learner.state_dict()
+    moved = (after["query.weight"] - before["query.weight"]).abs().max().item()
+    assert moved == pytest.approx(0.5 if critic_gradient else 0.0, rel=1e-3)
+    torch.testing.assert_close(after["key.weight"], (before["key.weight"] + after["query.weight"]) / 2)
+    assert not [name for name in method.tensors() if name.startswith("optimizer") and ".key." in name]
+
+
+def test_attention_is_known_of_methods_that_have_it() -> None:
+    lanes = [[trajectory(6, 0)], [trajectory(4, 1), trajectory(2, 2)]]
+    config = tcmrl.TcmrlConfig(latent=4)
+    found = attention_of(tcmrl.Tcmrl().create(problem(), settings(), config), lanes)
+    assert found is not None
+    torch.testing.assert_close(found.weights.sum(dim=-1), torch.ones(2))
+    assert attention_of(focal.Focal().create(problem(), settings(), focal.FocalConfig()), lanes) is None

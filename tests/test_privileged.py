@@ -1,0 +1,23 @@
+"""Task parameters as numbers, for controls that may see them."""
+
+import pytest
+import torch
+
+from tcmrl_algo.methods.privileged import TaskParameters
+from tcmrl_data import Task, TrainingError
+
+
+def task(index: int, **parameters: object) -> Task:
+    return Task(index, "train", parameters)
+
+
+def test_parameters_are_standardised_by_the_training_tasks() -> None:
+    training = [task(0, goal=[1.0, 5.0], angle=3), task(1, goal=[3.0, 5.0], angle=5)]
+    scaled = TaskParameters(training)
+    torch.testing.assert_close(scaled(training), torch.tensor([[-1.0, -1.0, 0.0], [1.0, 1.0, 0.0]]))
+    torch.testing.assert_close(scaled([task(7, angle=4, goal=[4.0, 6.0])]), torch.tensor([[0.0, 2.0, 1.0]]))
+
+
+def test_a_parameter_that_is_no_number_is_named() -> None:
+    with pytest.raises(TrainingError, match=r"task 4 has the parameter 'left'"):
+        TaskParameters([task(4, side="left")])
