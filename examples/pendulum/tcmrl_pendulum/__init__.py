@@ -1,0 +1,1 @@
+"""Plug-ins for tcmrl: a pendulum whose physics differ from task to task, and NumPy archives."""

@@ -1,0 +1,60 @@
+"""Gymnasium's Pendulum-v1, whose gravity, mass and length differ from task to task."""
+
+import importlib.resources
+from importlib.metadata import version
+from importlib.resources.abc import Traversable
+from typing import Any, final
+
+import gymnasium
+import numpy as np
+from pydantic import Field
+
+from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
+from tcmrl_data.envs.controller import View
+
+NOMINAL = {"gravity": 10.0, "mass": 1.0, "length": 1.0}
+"""Pendulum-v1's own values, in m/s², kg and m."""
+
+
+class PendulumSettings(EnvironmentSettings):
+    """The `[environment]` table.
+
+    Attributes:
+        spread: every parameter is drawn uniformly from its nominal value times [1 - spread, 1 + spread].
+    """
+
+    spread: float = Field(gt=0, lt=1)
+
+
+@final
+class Pendulum(Environment):
+    """Swing a pendulum up without knowing its physics; the reward is Gymnasium's."""
+
+    name = "pendulum"
+    Settings = PendulumSettings
+    observation_dim = 3
+    action_dim = 1
+    settings: PendulumSettings
+
+    @classmethod
+    def recipe_file(cls, name: str) -> Traversable:
+        return importlib.resources.files("tcmrl_pendulum") / "pendulum.toml"
+
+    def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
+        spread = self.settings.spread
+        factors = np.random.default_rng(task_seed).uniform(1 - spread, 1 + spread, (num_tasks, len(NOMINAL)))
+        return [dict(zip(NOMINAL, (row * list(NOMINAL.values())).tolist(), strict=True)) for row in factors]
+
+    def make(
+        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
+    ) -> gymnasium.Env[Any, Any]:
+        from gymnasium.envs.classic_control.pendulum import PendulumEnv
+        from gymnasium.wrappers import RescaleAction, TimeLimit
+
+        simulator = PendulumEnv(g=parameters["gravity"])
+        simulator.m, simulator.l = parameters["mass"], parameters["length"]
+        in_unit_range = RescaleAction(simulator, np.float32(-1.0), np.float32(1.0))
+        return TimeLimit(in_unit_range, self.settings.horizon)
+
+    def fingerprint(self) -> dict[str, Any]:
+        return {"versions": {"gymnasium": version("gymnasium")}}

@@ -1,0 +1,70 @@
+"""NumPy archives, `task_00000.npz` and so on, which `numpy.load` opens without pickle.
+
+| array | shape | holds |
+|---|---|---|
+| observations, next_observations | (N, observation_dim) float32 | all episodes behind one another |
+| actions | (N, action_dim) float32 | as executed, in [-1, 1] |
+| rewards | (N,) float32 | |
+| terminated, truncated | (N,) bool | the task's end, and the time limit |
+| episode | (N,) int64 | number of the episode, from 0 |
+| snapshot | (N,) int64 | training step of the policy that acted |
+| task | () text | the task as JSON: index, split, parameters |
+"""
+
+import json
+from pathlib import Path
+from typing import Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.selection import Selection
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
+from tcmrl_data.interchange.formats.new_folder import new_folder
+
+
+@final
+class NpzFormat(Format):
+    """One archive per task; a whole task is in memory at a time."""
+
+    name = "npz"
+
+    def export(
+        self,
+        dataset: Dataset,
+        out: Path,
+        *,
+        snapshots: str = "all",
+        progress: ExportProgress = no_progress,
+    ) -> list[Path]:
+        selection = dataset.select(snapshots=snapshots)
+        total, done = sum(len(steps) for steps in selection.steps.values()), 0
+        names = [f"task_{task.index:05d}.npz" for task in selection.tasks]
+        with new_folder(out) as folder:
+            for task, name in zip(selection.tasks, names, strict=True):
+                np.savez_compressed(folder / name, allow_pickle=False, **_arrays(selection, task))
+                done += len(selection.steps[task.index])
+                progress(done, total)
+        return [out / name for name in names]
+
+
+def _arrays(selection: Selection, task: Task) -> dict[str, npt.NDArray[Any]]:
+    steps = selection.steps[task.index]
+    parts = [(step, selection.dataset.trajectories(task.index, step)) for step in steps]
+    episodes = [(step, episode) for step, part in parts for episode in part]
+    lengths = [len(episode) for _, episode in episodes]
+    columns = {name: [getattr(episode, name) for _, episode in episodes] for name in _NAMES}
+    columns["observations"] = [episode.observations[:-1] for _, episode in episodes]
+    columns["next_observations"] = [episode.observations[1:] for _, episode in episodes]
+    described = {"index": task.index, "split": task.split, "parameters": dict(task.parameters)}
+    return {
+        **{name: np.concatenate(values) for name, values in columns.items()},
+        "episode": np.repeat(np.arange(len(episodes)), lengths),
+        "snapshot": np.repeat([step for step, _ in episodes], lengths),
+        "task": np.array(json.dumps(described)),
+    }
+
+
+_NAMES = ("actions", "rewards", "terminated", "truncated")

@@ -1,0 +1,134 @@
+"""A user's package, installed as a wheel beside tcmrl's wheel into an environment of its own, at work."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import venv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.plugin_packages import install
+from tests.workers import PATIENCE, ROOT
+
+TINY = (
+    "behavior.sac.steps=60",
+    "behavior.sac.warmup=20",
+    "behavior.sac.snapshots=[0,60]",
+    "behavior.sac.hidden=[8]",
+    "behavior.sac.batch_size=8",
+    "environment.horizon=20",
+    "rollouts.episodes=4",
+    "rollouts.lanes=4",
+    "build.train_tasks=3",
+    "build.test_tasks=1",
+)
+
+
+class Installation:
+    """An environment whose packages are wheels of the tree; libraries come from the running Python's."""
+
+    def __init__(self, folder: Path) -> None:
+        venv.create(folder, with_pip=False)
+        self.scripts = folder / "bin"
+        (self.site,) = (folder / "lib").glob("python3*/site-packages")
+        libraries = [path for path in sys.path if Path(path).name == "site-packages"]
+        (self.site / "libraries.pth").write_text("\n".join(libraries))
+        self._folder = folder
+
+    def install(self, source: Path) -> None:
+        """Builds a wheel of a source tree, without the network, and installs it."""
+        wheels = self._folder / "wheels" / source.name
+        copy = self._folder / "source" / source.name
+        shutil.copytree(source, copy, ignore=_no_source)
+        _run(sys.executable, "-m", "pip", "wheel", *OFFLINE, "--no-build-isolation", "-w", wheels, copy)
+        (wheel,) = wheels.glob("*.whl")
+        python = self.scripts / "python"
+        _run(sys.executable, "-m", "pip", "--python", python, "install", *OFFLINE, wheel)
+
+    def call(self, program: str, *arguments: object) -> str:
+        """Standard output of a console script that must succeed."""
+        return _run(self.scripts / program, *arguments)
+
+
+OFFLINE = ("--quiet", "--no-deps", "--no-index")
+
+
+def _run(*command: object) -> str:
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    done = subprocess.run(
+        [str(word) for word in command],
+        cwd="/",
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr + done.stdout
+    return done.stdout
+
+
+def _no_source(folder: str, names: list[str]) -> set[str]:
+    """What builds and commands leave in a tree, by .gitignore; some of it only at the top."""
+    made = {"data", "runs", "build", "dist"} if (Path(folder) / "pyproject.toml").is_file() else set()
+    return {name for name in names if name in made | {"__pycache__"} or name.startswith(".")}
+
+
+def _set(settings: tuple[str, ...]) -> list[str]:
+    return [word for setting in settings for word in ("--set", setting)]
+
+
+@pytest.fixture(scope="module")
+def installation(tmp_path_factory: pytest.TempPathFactory) -> Installation:
+    """tcmrl, the example, and a package whose one plug-in raises when it is imported."""
+    made = Installation(tmp_path_factory.mktemp("installation"))
+    made.install(ROOT)
+    made.install(ROOT / "examples" / "pendulum")
+    declares = {f"tcmrl.{group}": "defect = tcmrl_defect:Plugin" for group in ("environments", "formats")}
+    source = {"tcmrl_defect": "raise OSError('no such licence')"}
+    install(made.site, "tcmrl-defect", modules=source, declares=declares)
+    return made
+
+
+@pytest.fixture(scope="module")
+def pendulum(installation: Installation, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A small dataset of the example's environment, by its own recipe."""
+    out = tmp_path_factory.mktemp("pendulum") / "data"
+    options = ["--profile", "quick", "--behavior", "sac", "--workers", 1, "--quiet"]
+    installation.call("tcmrl-data", "build", "pendulum", *options, *_set(TINY), "--out", out)
+    return out
+
+
+def test_the_environment_of_a_users_package_is_built_and_verified(
+    installation: Installation, pendulum: Path
+) -> None:
+    tasks = json.loads(installation.call("tcmrl-data", "inspect", "tasks", pendulum, "--json"))["tasks"]
+    assert [sorted(task["parameters"]) for task in tasks] == [["gravity", "length", "mass"]] * 4
+    document = json.loads(installation.call("tcmrl-data", "verify", pendulum, "--replay", 1, "--json"))
+    assert document["findings"] == []
+
+
+def test_the_format_of_a_users_package_holds_every_episode(
+    installation: Installation, pendulum: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "exported"
+    installation.call("tcmrl-data", "export", pendulum, "--format", "npz", "--out", out)
+    assert len(list(out.iterdir())) == 4
+    with np.load(out / "task_00000.npz", allow_pickle=False) as arrays:
+        assert arrays["observations"].shape == arrays["next_observations"].shape == (160, 3)
+        assert (arrays["actions"].shape, int(arrays["truncated"].sum())) == ((160, 1), 8)
+        assert np.unique(arrays["snapshot"]).tolist() == [0, 60]
+        same_episode = arrays["episode"][1:] == arrays["episode"][:-1]
+        follows = (arrays["next_observations"][:-1] == arrays["observations"][1:]).all(axis=1)
+        assert (follows == same_episode).all()
+        assert json.loads(str(arrays["task"]))["index"] == 0
+
+
+def test_a_plug_in_that_cannot_be_imported_is_listed_with_its_error(installation: Installation) -> None:
+    listing = installation.call("tcmrl-data", "envs")
+    assert "pendulum" in listing and "point-robot" in listing
+    assert "defect" in listing and "no such licence" in listing
