@@ -42,6 +42,7 @@ class PluginName(click.ParamType):  # type: ignore[type-arg] # generic in newer 
 ALL_PROTOCOLS = "all"
 
 
+ALGORITHM = PluginName("tcmrl.algorithms", "algorithm")
 BEHAVIOR = PluginName("tcmrl.behavior", "behavior source")
 ENGINE = PluginName("tcmrl.engines", "engine")
 PROTOCOL = PluginName("tcmrl.protocols", "protocol", others=[ALL_PROTOCOLS])

@@ -17,6 +17,7 @@ from .frame import (
     stopped_by_signals,
     typed_command,
 )
+from .plugins import ALGORITHM
 from .progress import StageProgress
 from .reports import report
 from .runs import runs
@@ -58,9 +59,7 @@ tcmrl.add_command(runs)
 
 @tcmrl.command()
 @click.argument("manifest", metavar="MANIFEST", type=click.Path(path_type=Path))
-@click.option(
-    "--algo", metavar="NAME", help="tcmrl, focal, or the blind no_context; the recipe's if left out."
-)
+@click.option("--algo", type=ALGORITHM, help="The method; the recipe's if left out.")
 @click.option(
     "--profile",
     type=click.Choice(get_args(Profile)),

@@ -31,7 +31,6 @@ from .foundation.errors import CheckpointError as CheckpointError
 from .foundation.errors import SelectionError as SelectionError
 from .foundation.errors import TcmrlError as TcmrlError
 from .foundation.errors import TrainingError as TrainingError
-from .foundation.plugins import plugin as plugin
 from .foundation.seeding import NO_TASK as NO_TASK
 from .foundation.seeding import Purpose as Purpose
 from .foundation.seeding import keyed_generator as keyed_generator

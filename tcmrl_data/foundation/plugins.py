@@ -2,13 +2,10 @@
 
 import difflib
 import functools
-import importlib
 import inspect
-import pkgutil
 import sys
 from collections.abc import Iterable
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
-from types import ModuleType
 from typing import Generic, TypeVar
 
 from tcmrl_data.foundation.errors import PluginError, UnknownNameError
@@ -131,28 +128,6 @@ def _package(entry: EntryPoint) -> str:
 def one_line_error(error: BaseException) -> str:
     """Kind and message of what a plug-in raised."""
     return " ".join(f"{type(error).__name__}: {error}".split())
-
-
-def modules(package: str) -> list[ModuleType]:
-    """Imports every module of a plug-in package, sorted by file name.
-
-    Plug-in modules import heavy libraries inside functions, so that listing them stays cheap.
-    """
-    paths = importlib.import_module(package).__path__
-    names = sorted(info.name for info in pkgutil.iter_modules(paths) if not info.name.startswith("_"))
-    return [importlib.import_module(f"{package}.{name}") for name in names]
-
-
-def plugin(package: str, kind: str, name: str) -> ModuleType:
-    """The module of `package` whose NAME is `name`.
-
-    Raises:
-        UnknownNameError: no such plug-in; the message lists the nearest names.
-    """
-    found = {module.NAME: module for module in modules(package) if hasattr(module, "NAME")}
-    if name not in found:
-        raise unknown_name(kind, name, found)
-    return found[name]
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
