@@ -35,6 +35,7 @@ demo: $(INSTALLED)
 	@rm -rf $(RUN)
 	$(BIN)/tcmrl train $(DATA) --seed $(SEED) --out $(RUN)
 	$(BIN)/tcmrl evaluate $(RUN) --protocol all
+	@echo "Next: $(BIN)/tcmrl experiment tour --data $(DATA)"
 
 test: $(INSTALLED_TEST)
 	$(BIN)/python -m pytest -n $(JOBS)

@@ -58,6 +58,9 @@ def main_program(command: click.Command) -> NoReturn:
         if not obeyed:
             raise
         code = _fail(INTERRUPTED, INCOMPLETE)  # a library that was broken off may raise anything
+    if obeyed:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, signal.SIG_IGN)  # a handler of ours would not outlive the interpreter's end
     sys.exit(code)
 
 
@@ -151,7 +154,9 @@ def print_table(table: "Table") -> None:
             texts = (str(column.header), *map(str, column.cells))
             column.min_width = max(len(line) for text in texts for line in text.split("\n"))
     width = max(console.width, console.measure(table).minimum)
+    title, table.title = table.title or "", None
     with console.capture() as capture:
+        console.print(title, style="bold")  # by itself: a title of the table would wrap at the table's width
         console.print(table, width=width, crop=False)
     lines = capture.get().splitlines()
     click.echo("\n".join(lines if in_terminal else map(str.rstrip, lines)))
@@ -174,8 +179,6 @@ def make_table(
     table = Table(
         title=title,
         box=box.SIMPLE_HEAD,
-        title_justify="left",
-        title_style="bold",
         collapse_padding=True,
         pad_edge=False,
     )

@@ -1,11 +1,15 @@
 """Tables in a terminal of 80 columns and in a pipe: every number whole, every line as wide as it may be."""
 
+import contextlib
+import io
 import re
 import shutil
 from pathlib import Path
 
 import pytest
+from rich.table import Table
 from tcmrl_cli.data import data
+from tcmrl_cli.frame import make_table, print_table
 
 from tcmrl_data import Dataset
 from tests.commands import Call, in_process
@@ -71,3 +75,15 @@ def test_every_table_fits_a_terminal_and_says_what_it_says_in_a_pipe(
 
 def numbers(text: str) -> list[str]:
     return re.findall(r"-?[\d,]*\d(?:\.\d+)?", text)
+
+
+def test_a_title_longer_than_its_table_stays_on_one_line() -> None:
+    table = make_table("a title of more words than the table is wide", columns=["a"])
+    table.add_row("1")
+    assert render(table).splitlines()[0] == "a title of more words than the table is wide"
+
+
+def render(table: Table) -> str:
+    with contextlib.redirect_stdout(io.StringIO()) as stream:
+        print_table(table)
+    return stream.getvalue()
