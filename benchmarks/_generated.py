@@ -5,9 +5,10 @@ from pathlib import Path
 import numpy as np
 
 import tcmrl_data
-from tcmrl_data.behavior.snapshot import ScriptedPolicy, Snapshot
+from tcmrl_data.behavior.snapshot import ScriptedDescription, Snapshot
 from tcmrl_data.build.driver import Driver, make_groups
 from tcmrl_data.build.part import seal_part
+from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.provenance import provenance
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
@@ -55,7 +56,7 @@ def generate_dataset(
         for step in steps:
             if not (folder / part_folder(task.index, step)).is_dir():
                 _publish(folder, recipe, task, step, seed=seed)
-    Driver(recipe, folder, seed, chosen).write_manifest()
+    Driver(BuildPlan.of_tasks(recipe, seed=seed, tasks=chosen), folder).write_manifest()
     return len(chosen) * snapshots * episodes * environment.settings.horizon
 
 
@@ -63,7 +64,7 @@ def _publish(folder: Path, recipe: Recipe, task: Task, step: int, *, seed: int) 
     environment = recipe.make_environment()
     random = np.random.default_rng([seed, task.index, step])
     trajectories = [_noise(random, environment) for _ in range(recipe.rollouts.episodes)]
-    snapshot = Snapshot(step, ScriptedPolicy(observation="stored", noise=1.0))
+    snapshot = Snapshot(step, ScriptedDescription(observation="stored", noise=1.0))
     _, files = seal_part(
         recipe,
         seed,

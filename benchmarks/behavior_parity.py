@@ -27,7 +27,6 @@ from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.build.part import roll_out_part
-from tcmrl_data.build.unit import behavior_source
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.recipe.tasks import choose_tasks
 
@@ -50,7 +49,7 @@ def curves(recipe: Recipe, tasks: list[Task], seed: int) -> Returns:
         checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
     )
     found = defaultdict(list)
-    for task, snapshot in behavior_source(recipe).snapshots(context):
+    for task, snapshot in recipe.make_source().snapshots(context):
         lanes = environment.lanes([task.parameters] * recipe.rollouts.lanes)
         episodes = roll_out_part(
             recipe, seed, environment=environment, task=task, snapshot=snapshot, lanes=lanes

@@ -23,7 +23,6 @@ from typing import Any
 from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.build.unit import behavior_source
 from tcmrl_data.recipe.tasks import choose_tasks
 
 SETTINGS = [
@@ -67,7 +66,7 @@ def measure(recipe: Recipe, num_tasks: int, seconds: float) -> float:
         checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
     )
     try:
-        for _ in behavior_source(recipe).snapshots(context):
+        for _ in recipe.make_source().snapshots(context):
             pass
     except _OverError:
         pass

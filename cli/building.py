@@ -101,7 +101,7 @@ def plan(
     recipe = _load(environment, profile, behavior, overrides)
     chosen = _parse_tasks(recipe, tasks)
     remark("measuring this machine for a few seconds …", quiet=quiet or as_json)
-    planned = tcmrl_data.plan_build(recipe, tasks=chosen, workers=workers)
+    planned = tcmrl_data.forecast_build(tcmrl_data.plan_build(recipe, tasks=chosen), workers=workers)
     if as_json:
         print_json(dataclasses.asdict(planned))
         return

@@ -5,7 +5,9 @@ from .build.build import build_dataset as build_dataset
 from .build.events import BuildEvent as BuildEvent
 from .build.events import BuildStatus as BuildStatus
 from .build.events import build_status as build_status
-from .build.plan import Plan as Plan
+from .build.forecast import Forecast as Forecast
+from .build.forecast import forecast_build as forecast_build
+from .build.plan import BuildPlan as BuildPlan
 from .build.plan import plan_build as plan_build
 from .dataset.dataset import Dataset as Dataset
 from .dataset.dataset import open_dataset as open_dataset

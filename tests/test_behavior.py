@@ -10,7 +10,6 @@ from pydantic import ValidationError
 from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.build.unit import behavior_source
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.envs.tasks import draw_tasks
 from tcmrl_data.foundation.errors import RecipeError
@@ -30,12 +29,12 @@ def recipe_with(name: str) -> Recipe:
 
 
 def source_with(name: str) -> BehaviorSource:
-    return behavior_source(recipe_with(name))
+    return recipe_with(name).make_source()
 
 
 def first_snapshot(recipe: Recipe, folder: Path, reported: list[int]) -> tuple[int, int, str]:
     """Task, step and digest of the first snapshot of the first unit."""
-    environment, source = recipe.make_environment(), behavior_source(recipe)
+    environment, source = recipe.make_environment(), recipe.make_source()
     context = BehaviorContext(
         environment=environment,
         tasks=draw_tasks(environment)[: min(2, source.group_size)],

@@ -22,6 +22,7 @@ from tcmrl_data import (
 )
 from tcmrl_data.build.driver import Driver
 from tcmrl_data.build.events import EventLog
+from tcmrl_data.build.plan import plan_build
 from tcmrl_data.build.unit import UnitSpec, run_unit
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.envs.base import LaneStep
@@ -169,7 +170,7 @@ class HastyEngine(BaseEngine):
 
 
 def test_a_unit_that_is_done_without_its_parts_failed(tiny_recipe: Recipe, tmp_path: Path) -> None:
-    driver = Driver(tiny_recipe, tmp_path, 0, choose_tasks(tiny_recipe, [3]))
+    driver = Driver(plan_build(tiny_recipe, tasks=[3]), tmp_path)
     with EventLog(tmp_path, lambda event: None) as log:
         (failure,) = driver.run(HastyEngine(), log)
     assert "task 3 failed" in failure

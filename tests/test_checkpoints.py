@@ -8,7 +8,6 @@ from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.build.unit import behavior_source
 from tcmrl_data.foundation.disk import CHECKPOINTS
 from tcmrl_data.recipe.tasks import choose_tasks
 from tests.conftest import TINY
@@ -45,7 +44,7 @@ def trained(
         report=report,
         checkpoints=lambda task: folder(dataset, seconds=seconds),
     )
-    yield from (snapshot for _, snapshot in behavior_source(recipe).snapshots(context))
+    yield from (snapshot for _, snapshot in recipe.make_source().snapshots(context))
 
 
 HOPPER = (*TINY, "behavior.sac.steps=300", "behavior.sac.snapshots=[0,200,300]")

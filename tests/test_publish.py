@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 
 from tcmrl_data import Dataset, Recipe, open_dataset
-from tcmrl_data.build import build
 from tcmrl_data.build.driver import check_part
+from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, lock_holder, publish_folder, remove_abandoned
 from tcmrl_data.foundation.errors import LockedError, StorageError, TcmrlError
@@ -185,7 +185,7 @@ def test_a_full_disk_ends_in_a_clear_error_and_a_resumable_dataset(
         pytest.skip(f"no tmpfs can be mounted here: {mounted.stderr.decode().strip()}")
     try:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(build, "part_bytes", lambda recipe: 0)  # let it start, so that it fills up
+            patch.setattr(BuildPlan, "part_bytes", 0)  # let it start, so that it fills up
             (failure,) = parts.build(disk / "data", patch).failed
         assert "No space left on device; make room" in failure
         subprocess.run(["mount", "-o", "remount,size=10m", str(disk)], check=True)
@@ -197,7 +197,7 @@ def test_a_full_disk_ends_in_a_clear_error_and_a_resumable_dataset(
 def test_too_little_space_is_said_before_the_start(
     parts: PreparedParts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(build, "part_bytes", lambda recipe: 10**15)
+    monkeypatch.setattr(BuildPlan, "part_bytes", 10**15)
     with pytest.raises(StorageError, match=r"3 parts take up to 3000.0 TB, \d+\.\d [kMGT]B are free"):
         parts.build(tmp_path / "data", monkeypatch)
     assert not (tmp_path / "data" / "tasks").exists()

@@ -17,7 +17,8 @@ from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.behavior.stacked.source import StackedSettings, StackedSource, _make_training
 from tcmrl_data.behavior.stacked.training import GroupTraining
-from tcmrl_data.build.unit import UnitSpec, unit_memory
+from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.build.unit import UnitSpec
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import CHECKPOINTS, make_folders
 from tcmrl_data.foundation.errors import BuildError
@@ -314,7 +315,7 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", program], input=spec, capture_output=True, text=True, check=True
     )
-    planned = unit_memory(recipe, len(tasks))
+    planned = BuildPlan.of_tasks(recipe, seed=0, tasks=tasks).unit_bytes(len(tasks))
     assert 0.4 * planned < int(done.stdout) < planned
 
 

@@ -9,15 +9,13 @@ from typing import Any
 
 from tcmrl_data.build.driver import Driver
 from tcmrl_data.build.events import EVENTS, BuildEvent, EventLog
-from tcmrl_data.build.part import part_bytes
+from tcmrl_data.build.plan import plan_build
 from tcmrl_data.build.work_files import check_work_files
 from tcmrl_data.engine.base import ENGINES
-from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
 from tcmrl_data.foundation.sizes import size
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import DATA_VERSION, MANIFEST, read_manifest
 
 SEEDS = 2**63
@@ -81,7 +79,7 @@ def build_dataset(
     if not 0 <= seed < SEEDS:
         raise BuildError(f"seed {seed} is not in [0, 2**63); choose a smaller --seed")
     runner = ENGINES.get(engine)(workers, address=address)
-    chosen = choose_tasks(recipe, tasks)
+    plan = plan_build(recipe, seed=seed, tasks=tasks)
     _check_folder(out, recipe, seed)
     make_folders(out)
     failed: tuple[str, ...] = ()
@@ -89,8 +87,8 @@ def build_dataset(
     try:
         with lock_file(out / LOCK, f"dataset {out}"):
             remove_abandoned(out)
-            driver = Driver(recipe, out, seed, [*_earlier_tasks(out, recipe), *chosen])
-            _check_space(out, recipe, driver.missing_parts)
+            driver = Driver(plan.with_tasks(_earlier_tasks(out)), out)
+            _check_space(out, driver.missing_parts * plan.part_bytes, driver.missing_parts)
             present = len(driver.parts)
             if driver.missing_parts:
                 with EventLog(out, progress) as log:
@@ -98,7 +96,7 @@ def build_dataset(
             else:
                 driver.write_manifest()
     except ReadOnlyError:
-        driver = Driver(recipe, out, seed, [*_earlier_tasks(out, recipe), *chosen])
+        driver = Driver(plan.with_tasks(_earlier_tasks(out)), out)
         present, read_only = len(driver.parts), True
         if not driver.is_finished():
             raise
@@ -139,16 +137,14 @@ def _first_difference(old: Any, new: Any, path: str = "") -> str | None:
     return None if old == new else f"{path} is {old} there and {new} here"
 
 
-def _earlier_tasks(out: Path, recipe: Recipe) -> list[Task]:
-    """Tasks that the dataset already has, built or planned."""
-    if not (out / MANIFEST).is_file():
-        return []
-    return choose_tasks(recipe, [task.index for task in read_manifest(out).tasks])
+def _earlier_tasks(out: Path) -> list[int]:
+    """Indices of the tasks that the dataset already has, built or planned."""
+    return [task.index for task in read_manifest(out).tasks] if (out / MANIFEST).is_file() else []
 
 
-def _check_space(out: Path, recipe: Recipe, num_parts: int) -> None:
+def _check_space(out: Path, needed: int, num_parts: int) -> None:
     """Refuses a build that the disk has no room for, arrays counted before compression."""
-    needed, free = num_parts * part_bytes(recipe), shutil.disk_usage(out).free
+    free = shutil.disk_usage(out).free
     if needed > free:
         raise StorageError(
             f"{out}: {num_parts} parts take up to {size(needed)}, {size(free)} are free; "

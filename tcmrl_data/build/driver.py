@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.build.events import BuildEvent, EventKind, EventLog
-from tcmrl_data.build.unit import UnitSpec, behavior_source, unit_memory
+from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.build.unit import UnitSpec
 from tcmrl_data.engine.base import BaseEngine, Result, Unit
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import group_tasks
 from tcmrl_data.store.layout import GROUP, check_layout
 from tcmrl_data.store.manifest import (
     DATA_VERSION,
@@ -38,12 +37,19 @@ MANIFEST_SECONDS = 1.0
 
 
 class Driver:
-    """The one writer of a dataset's manifest."""
+    """The one writer of a dataset's manifest.
 
-    def __init__(self, recipe: Recipe, out: Path, seed: int, tasks: Sequence[Task]) -> None:
-        self._recipe, self._out, self._seed = recipe, out, seed
-        self._source = behavior_source(recipe)
-        self._tasks = {task.index: task for task in tasks}
+    Args:
+        plan: what to build.
+        out: the dataset's folder; its published parts are checked and taken in.
+
+    Raises:
+        StoreError: a published part is damaged, or is not of the plan.
+    """
+
+    def __init__(self, plan: BuildPlan, out: Path) -> None:
+        self._plan, self._out, self._source = plan, out, plan.source
+        self._tasks = {task.index: task for task in plan.tasks}
         self.parts: dict[tuple[int, int], PartRecord] = {}
         self._entries: dict[tuple[int, int], PartEntry] = {}
         for index in self._tasks:
@@ -66,9 +72,7 @@ class Driver:
         """
         missing = [task for task in self._tasks.values() if not self._is_done(task.index)]
         groups = [
-            group
-            for group in group_tasks(self._tasks.values(), self._source.group_size)
-            if not all(self._is_done(task.index) for task in group)
+            group for group in self._plan.groups if not all(self._is_done(task.index) for task in group)
         ]
         tasks_of = {_unit_id(group): group for group in groups}
         units = [self._unit(group) for group in groups]
@@ -102,17 +106,17 @@ class Driver:
 
     def _unit(self, tasks: tuple[Task, ...]) -> Unit:
         """The unit of a group; done tasks stay in it, since a group's composition may change rounding."""
-        spec = UnitSpec(self._out.resolve(), self._recipe, self._seed, tasks)
-        asked = self._recipe.build
+        spec = UnitSpec(self._out.resolve(), self._plan.recipe, self._plan.seed, tasks)
+        reserved = self._plan.recipe.build
         return Unit(
             _unit_id(tasks),
             spec.to_json(),
             WORKER,
             cost=self._source.training_steps * len(tasks),
-            cpus=asked.cpus,
-            gpus=asked.gpus,
-            memory=max(asked.memory, unit_memory(self._recipe, len(tasks))),
-            timeout=asked.timeout,
+            cpus=reserved.cpus,
+            gpus=reserved.gpus,
+            memory=max(reserved.memory, self._plan.unit_bytes(len(tasks))),
+            timeout=reserved.timeout,
         )
 
     def _is_done(self, index: int) -> bool:
@@ -145,9 +149,10 @@ class Driver:
         folder = self._out / part_folder(task, step)
         self.parts[task, step] = record = check_part(folder)
         sealed = sha256((folder / "part.json").read_bytes())
-        if (record.identity.task, record.identity.step, record.identity.seed) != (task, step, self._seed):
+        found = record.identity
+        if (found.task, found.step, found.seed) != (task, step, self._plan.seed):
             raise StoreError(f"{folder}: holds another part; run `tcmrl-data repair`")
-        if record.identity.settings != self._recipe.unit_settings():
+        if record.identity.settings != self._plan.recipe.unit_settings():
             raise StoreError(f"{folder}: was built with other settings; run `tcmrl-data repair`")
         self._entries[task, step] = PartEntry(task=task, step=step, id=record.id, sha256=sealed)
 
@@ -173,10 +178,10 @@ class Driver:
         tasks = [self._tasks[index] for index in sorted(self._tasks)]
         fields = {
             "schema_version": SCHEMA_VERSION,
-            "name": self._recipe.environment["name"],
+            "name": self._plan.environment.name,
             "data_version": DATA_VERSION,
-            "seed": self._seed,
-            "recipe": self._recipe.model_dump(mode="json"),
+            "seed": self._plan.seed,
+            "recipe": self._plan.recipe.model_dump(mode="json"),
             "steps": list(self._source.steps),
             "tasks": [{"index": t.index, "split": t.split, "parameters": dict(t.parameters)} for t in tasks],
             "parts": [entry.model_dump(mode="json") for entry in entries],

@@ -7,6 +7,7 @@ from typing import Any, final
 import numpy as np
 
 from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.provenance import provenance
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.base import Environment, Lanes
@@ -40,9 +41,7 @@ class PartMaker:
 
     Args:
         dataset: its folder.
-        recipe: how the dataset is built.
-        seed: root seed of the build.
-        environment: the recipe's.
+        plan: of the build.
         task: whose snapshots these are.
         behavior: what the behavior source has recorded with its parts.
     """
@@ -50,17 +49,14 @@ class PartMaker:
     def __init__(
         self,
         dataset: Path,
-        recipe: Recipe,
-        seed: int,
+        plan: BuildPlan,
         *,
-        environment: Environment,
         task: Task,
         behavior: Mapping[str, Any],
     ) -> None:
         self.task = task
-        self._behavior = behavior
-        self._dataset, self._recipe, self._seed, self._environment = dataset, recipe, seed, environment
-        self._parameters = [task.parameters] * recipe.rollouts.lanes
+        self._dataset, self._plan, self._behavior = dataset, plan, behavior
+        self._parameters = [task.parameters] * plan.recipe.rollouts.lanes
         self._lanes: Lanes | None = None
         self._references: References | None = None
 
@@ -97,31 +93,36 @@ class PartMaker:
 
     def _make(self, snapshot: Snapshot) -> tuple[str, dict[str, bytes]]:
         """The id and all files of the snapshot's part."""
-        environment, task = self._environment, self.task
+        plan, task = self._plan, self.task
         if self._lanes is None:
-            self._lanes = environment.lanes(self._parameters)
+            self._lanes = plan.environment.lanes(self._parameters)
         trajectories = roll_out_part(
-            self._recipe, self._seed, environment=environment, task=task, snapshot=snapshot, lanes=self._lanes
+            plan.recipe,
+            plan.seed,
+            environment=plan.environment,
+            task=task,
+            snapshot=snapshot,
+            lanes=self._lanes,
         )
-        place = f"{environment.name}, task {task.index}, snapshot step {snapshot.step}"
+        place = f"{plan.environment.name}, task {task.index}, snapshot step {snapshot.step}"
         _check_finite(trajectories, place)
         if self._references is None:
             self._references = self._measure_references()
         return seal_part(
-            self._recipe,
-            self._seed,
+            plan.recipe,
+            plan.seed,
             task=task,
             snapshot=snapshot,
             trajectories=trajectories,
             references=self._references,
-            provenance=provenance(environment, self._behavior),
+            provenance=provenance(plan.environment, self._behavior),
         )
 
     def _measure_references(self) -> References:
         """Uniform, oracle and noise-free scripted returns of the task, from the recipe's episodes each."""
-        environment, lanes = self._environment, self._lanes
+        environment, lanes = self._plan.environment, self._lanes
         assert lanes is not None
-        key = (self._seed, environment.name, self.task.index)
+        key = (self._plan.seed, environment.name, self.task.index)
 
         def mean_return(controller: Controller | None) -> float | None:
             if controller is None:
@@ -130,7 +131,7 @@ class PartMaker:
                 environment,
                 lanes,
                 controller,
-                num_episodes=self._recipe.rollouts.episodes,
+                num_episodes=self._plan.recipe.rollouts.episodes,
                 reset_key=(*key, Purpose.REFERENCE_RESET),
                 noise_key=(*key, Purpose.REFERENCE_NOISE),
             )
@@ -184,13 +185,6 @@ def seal_part(
         provenance=dict(provenance),
     )
     return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}
-
-
-def part_bytes(recipe: Recipe) -> int:
-    """Size of a part's arrays before compression, for episodes of full length."""
-    environment = recipe.make_environment()
-    row_bytes = 4 * (environment.observation_dim + environment.action_dim + 1) + 2
-    return recipe.rollouts.episodes * (environment.settings.horizon + 1) * row_bytes
 
 
 def roll_out_part(

@@ -1,140 +1,88 @@
-"""What a build will take: tasks, parts, environment steps, bytes, and a time measured by a short probe."""
+"""A build's plan: what follows from a recipe, derived once and handed on."""
 
-import contextlib
-import math
-import os
-import time
-from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
 
-from tcmrl_data.behavior.base import BehaviorContext
-from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.build.part import part_bytes
-from tcmrl_data.build.unit import behavior_source, unit_memory
+from tcmrl_data.behavior.base import BehaviorSource
 from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.controller import UniformController
-from tcmrl_data.envs.rollout import roll_out
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
+from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
+from tcmrl_data.recipe.tasks import choose_tasks, group_tasks, pick_tasks
 
-PROBE_SECONDS = 6.0
-UNIT_START_SECONDS = 3.0
-"""Starting a worker process, mostly importing torch; measured as 2 to 4 s."""
+PROCESS_BYTES = 400 * 2**20
+"""A worker beside its data: torch, MuJoCo and Zarr take about 310 MB as measured; the rest is margin."""
+HOLES = 0.04
+"""Share of a set of simulators, as planned, that stays lost with every part; measured on half-cheetah-vel."""
+PART_COPIES = 4
+"""A part's arrays lie in memory as lane arrays, trajectories, packed rows and files."""
 
 
 @dataclass(frozen=True)
-class Plan:
-    """A build before it starts.
+class BuildPlan:
+    """What a build, its driver and its workers share.
 
     Attributes:
-        training_steps: environment steps of behavior training, all tasks together.
-        rollout_steps: stored environment steps, at most; episodes may end early.
-        bytes: size of the arrays before compression, an upper bound.
-        unit_bytes: most memory that a worker takes.
-        seconds: estimated wall time with `workers` processes on this machine.
+        recipe: the resolved recipe.
+        seed: root seed of behavior training and rollouts.
+        environment: the recipe's.
+        source: the recipe's behavior source.
+        tasks: the tasks to build, ascending by index.
+        groups: the same tasks, those of one unit together.
     """
 
-    environment: str
-    profile: str
-    behavior: str
-    tasks: int
-    train: int
-    test: int
-    snapshots: int
-    parts: int
-    episodes: int
-    training_steps: int
-    rollout_steps: int
-    bytes: int
-    workers: int
-    unit_bytes: int
-    seconds: float
+    recipe: Recipe
+    seed: int
+    environment: Environment
+    source: BehaviorSource
+    tasks: tuple[Task, ...]
+    groups: tuple[tuple[Task, ...], ...]
+
+    @classmethod
+    def of_tasks(cls, recipe: Recipe, *, seed: int, tasks: Iterable[Task]) -> "BuildPlan":
+        """The plan of a recipe for tasks that are known already."""
+        return cls(recipe, seed, recipe.make_environment(), recipe.make_source(), (), ())._holding(tasks)
+
+    def with_tasks(self, indices: Iterable[int]) -> "BuildPlan":
+        """The same plan, with further tasks of the environment.
+
+        Raises:
+            TaskError: an index outside the task set.
+        """
+        wanted = {*indices, *(task.index for task in self.tasks)}
+        return self._holding(pick_tasks(draw_tasks(self.environment), self.recipe.build, sorted(wanted)))
+
+    def _holding(self, tasks: Iterable[Task]) -> "BuildPlan":
+        ordered = tuple(sorted(tasks, key=lambda task: task.index))
+        return replace(self, tasks=ordered, groups=tuple(group_tasks(ordered, self.source.group_size)))
+
+    @property
+    def part_bytes(self) -> int:
+        """Size of a part's arrays before compression, for episodes of full length."""
+        row_bytes = 4 * (self.environment.observation_dim + self.environment.action_dim + 1) + 2
+        return self.recipe.rollouts.episodes * (self.environment.settings.horizon + 1) * row_bytes
+
+    def unit_bytes(self, num_tasks: int) -> int:
+        """Most memory that the process of a unit of `num_tasks` tasks is planned to take."""
+        lanes = self.recipe.rollouts.lanes
+        # closed lanes are freed late, by the garbage collector, and leave holes in the heap
+        simulators = num_tasks + 2 * lanes + HOLES * lanes * num_tasks * len(self.source.steps)
+        return (
+            PROCESS_BYTES
+            + self.source.training_bytes(self.environment, num_tasks)
+            + int(simulators * self.environment.simulator_bytes)
+            + PART_COPIES * self.part_bytes
+        )
 
 
-class _ProbeOverError(Exception):
-    """Ends behavior training once enough has been measured."""
+def plan_build(recipe: Recipe, *, seed: int = 0, tasks: Sequence[int] | None = None) -> BuildPlan:
+    """The plan of a build.
 
-
-def plan_build(recipe: Recipe, *, tasks: Sequence[int] | None = None, workers: int | None = None) -> Plan:
-    """Plans a build and measures this machine for a few seconds.
+    Args:
+        recipe: what to build.
+        seed: root seed of behavior training and rollouts.
+        tasks: indices of the full task set instead of the profile's choice.
 
     Raises:
         TaskError: an index outside the task set.
     """
-    chosen = choose_tasks(recipe, tasks)
-    environment, source = recipe.make_environment(), behavior_source(recipe)
-    workers = workers or available_cores()
-    episodes, horizon = recipe.rollouts.episodes, environment.settings.horizon
-    parts = len(chosen) * len(source.steps)
-    groups = group_tasks(chosen, source.group_size)
-    largest = max(groups, key=len)
-    task_seconds = source.training_steps * _training_seconds_per_step(recipe, environment, largest)
-    task_seconds += len(source.steps) * episodes * _seconds_per_episode(recipe, environment, chosen[0])
-    unit_seconds = UNIT_START_SECONDS + len(largest) * task_seconds
-    return Plan(
-        environment=environment.name,
-        profile=recipe.profile,
-        behavior=recipe.behavior["source"],
-        tasks=len(chosen),
-        train=sum(task.split == "train" for task in chosen),
-        test=sum(task.split == "test" for task in chosen),
-        snapshots=len(source.steps),
-        parts=parts,
-        episodes=parts * episodes,
-        training_steps=len(chosen) * source.training_steps,
-        rollout_steps=parts * episodes * horizon,
-        bytes=parts * part_bytes(recipe),
-        workers=workers,
-        unit_bytes=unit_memory(recipe, len(largest)),
-        seconds=unit_seconds * math.ceil(len(groups) / workers),
-    )
-
-
-def _training_seconds_per_step(recipe: Recipe, environment: Environment, tasks: Sequence[Task]) -> float:
-    """Measured on a real training of the tasks, at the end of the probe, when the warm-up is over."""
-    marks: list[tuple[float, int]] = []
-    started = time.monotonic()
-
-    def report(count: int) -> None:
-        now = time.monotonic()
-        marks.append((now, count))
-        if now - started > PROBE_SECONDS:
-            raise _ProbeOverError
-
-    context = BehaviorContext(
-        environment=environment,
-        tasks=tasks,
-        seed=0,
-        observation=recipe.behavior["observation"],
-        reward=recipe.behavior["reward"],
-        report=report,
-        checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
-    )
-    with contextlib.suppress(_ProbeOverError):
-        for _ in behavior_source(recipe).snapshots(context):
-            pass
-    late = [mark for mark in marks if mark[0] > started + PROBE_SECONDS / 2] or marks
-    if len(late) < 2:
-        return 0.0 if not marks else (marks[-1][0] - started) / sum(count for _, count in marks)
-    return (late[-1][0] - late[0][0]) / sum(count for _, count in late[1:])
-
-
-def _seconds_per_episode(recipe: Recipe, environment: Environment, task: Task) -> float:
-    """Measured on one lane batch of uniform actions; a policy's own cost is small beside it."""
-    num_lanes = recipe.rollouts.lanes
-    lanes = environment.lanes([task.parameters] * num_lanes)
-    key = (0, environment.name, task.index)
-    started = time.monotonic()
-    roll_out(
-        environment,
-        lanes,
-        UniformController(),
-        reset_seeds=[keyed_seed(*key, Purpose.REFERENCE_RESET, lane) for lane in range(num_lanes)],
-        noise=[keyed_generator(*key, Purpose.REFERENCE_NOISE, lane) for lane in range(num_lanes)],
-    )
-    lanes.close()
-    return (time.monotonic() - started) / num_lanes
+    return BuildPlan.of_tasks(recipe, seed=seed, tasks=choose_tasks(recipe, tasks))

@@ -7,22 +7,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorContext, BehaviorSource
+from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.build.part import PartMaker, part_bytes
+from tcmrl_data.build.part import PartMaker
+from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.provenance import package_versions
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.manifest import DATA_VERSION, part_folder, read_part_record
-
-PROCESS_BYTES = 400 * 2**20
-"""A worker beside its data: torch, MuJoCo and Zarr take about 310 MB as measured; the rest is margin."""
-HOLES = 0.04
-"""Share of a set of simulators, as planned, that stays lost with every part; measured on half-cheetah-vel."""
-PART_COPIES = 4
-"""A part's arrays lie in memory as lane arrays, trajectories, packed rows and files."""
 
 
 @dataclass(frozen=True)
@@ -58,25 +52,6 @@ class UnitSpec:
         return cls(Path(values["dataset"]), recipe, values["seed"], tasks)
 
 
-def behavior_source(recipe: Recipe) -> BehaviorSource:
-    """The recipe's behavior source with its settings."""
-    kind = BEHAVIOR_SOURCES.get(recipe.behavior["source"])
-    return kind(kind.Settings.model_validate_json(canonical_json(recipe.behavior["settings"])))
-
-
-def unit_memory(recipe: Recipe, num_tasks: int) -> int:
-    """Most memory, in bytes, that the process of a unit of `num_tasks` tasks is planned to take."""
-    environment, source, lanes = recipe.make_environment(), behavior_source(recipe), recipe.rollouts.lanes
-    # closed lanes are freed late, by the garbage collector, and leave holes in the heap
-    simulators = num_tasks + 2 * lanes + HOLES * lanes * num_tasks * len(source.steps)
-    return (
-        PROCESS_BYTES
-        + source.training_bytes(environment, num_tasks)
-        + int(simulators * environment.simulator_bytes)
-        + PART_COPIES * part_bytes(recipe)
-    )
-
-
 def run_unit(spec: UnitSpec, report: Send) -> str:
     """Makes every missing part of the unit's tasks; parts already published are left alone.
 
@@ -86,21 +61,21 @@ def run_unit(spec: UnitSpec, report: Send) -> str:
     Raises:
         NondeterminismError: a published part of the same task and step has another id.
     """
-    source = behavior_source(spec.recipe)
+    plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks)
     folders = {
         (task.index, step): spec.dataset / part_folder(task.index, step)
         for task in spec.tasks
-        for step in source.steps
+        for step in plan.source.steps
     }
     if not all((folder / "part.json").is_file() for folder in folders.values()):
-        _make_parts(spec, source, report)
+        _make_parts(spec, plan, report)
     return digest([read_part_record(folder / "part.json").id for folder in folders.values()])
 
 
-def _make_parts(spec: UnitSpec, source: BehaviorSource, report: Send) -> None:
-    environment = spec.recipe.make_environment()
+def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
+    source = plan.source
     context = BehaviorContext(
-        environment=environment,
+        environment=plan.environment,
         tasks=spec.tasks,
         seed=spec.seed,
         observation=spec.recipe.behavior["observation"],
@@ -116,14 +91,7 @@ def _make_parts(spec: UnitSpec, source: BehaviorSource, report: Send) -> None:
             if task.index not in wanted:
                 continue
             if task.index not in makers:
-                makers[task.index] = PartMaker(
-                    spec.dataset,
-                    spec.recipe,
-                    spec.seed,
-                    environment=environment,
-                    task=task,
-                    behavior=recorded,
-                )
+                makers[task.index] = PartMaker(spec.dataset, plan, task=task, behavior=recorded)
                 stack.callback(makers[task.index].close)
             makers[task.index].publish(snapshot, report)
             # simulators of many tasks would fill the memory: a group makes them anew for every part

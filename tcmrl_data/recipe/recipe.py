@@ -8,8 +8,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data.behavior.base import BEHAVIOR_SOURCES
+from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorSource
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment, make_environment
+from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.errors import RecipeError
 from tcmrl_data.foundation.validation import validate_table
 
@@ -98,6 +99,11 @@ class Recipe(_Table):
     def make_environment(self) -> Environment:
         """The recipe's environment."""
         return make_environment(self.environment)
+
+    def make_source(self) -> BehaviorSource:
+        """The recipe's behavior source with its settings."""
+        kind = BEHAVIOR_SOURCES.get(self.behavior["source"])
+        return kind(kind.Settings.model_validate_json(canonical_json(self.behavior["settings"])))
 
 
 class _Behavior(_Table):

@@ -7,7 +7,7 @@ import numpy as np
 
 from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.foundation.errors import TaskError
-from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.recipe.recipe import Recipe, TaskChoice
 
 
 def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]:
@@ -29,16 +29,20 @@ def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]
 
 
 def choose_tasks(recipe: Recipe, indices: Sequence[int] | None = None) -> list[Task]:
-    """The named tasks, or those that the recipe's profile chooses, ascending.
+    """The named tasks of a recipe, or those that its profile chooses; errors as for `pick_tasks`."""
+    return pick_tasks(draw_tasks(recipe.make_environment()), recipe.build, indices)
+
+
+def pick_tasks(tasks: Sequence[Task], choice: TaskChoice, indices: Sequence[int] | None = None) -> list[Task]:
+    """The named tasks of a task set, or those of a choice, ascending.
 
     Raises:
-        TaskError: an index outside the task set, or a profile that asks for more tasks than there are.
+        TaskError: an index outside the task set, or a choice of more tasks than there are.
     """
-    tasks = draw_tasks(recipe.make_environment())
     if indices is None:
         num_train, num_test = (
-            sum(task.split == split for task in tasks) if asked is None else asked
-            for split, asked in (("train", recipe.build.train_tasks), ("test", recipe.build.test_tasks))
+            sum(task.split == split for task in tasks) if wanted is None else wanted
+            for split, wanted in (("train", choice.train_tasks), ("test", choice.test_tasks))
         )
         indices = spread(tasks, num_train=num_train, num_test=num_test)
     for index in indices:
