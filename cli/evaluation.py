@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from tcmrl_algo import Evaluation, TaskResult
 
 OTHER = "other: the same policy under other tasks' contexts"
+PRIVILEGED = "privileged: a control that sees the parameters of the tasks"
 SCORES = {
     "regret": "regret: oracle - adapted",
     "normalized": "normalized: 0 is uniform actions, 1 the best behavior policy",
@@ -25,7 +26,8 @@ SCORES = {
 def score_tables(results: Sequence["Evaluation"]) -> list["Table"]:
     """One protocol: its test tasks. Several: the means of every protocol, then the test tasks of each."""
     first = results[0]
-    run = f"{first.algorithm} on {first.environment}, seed {first.seed}"
+    mark = " (privileged)" if first.privileged else ""
+    run = f"{first.algorithm}{mark} on {first.environment}, seed {first.seed}"
     score, with_success = _score(results), _with_success(results)
 
     def table(title: str, row_name: str) -> "Table":
@@ -125,7 +127,8 @@ def evaluate(
         return
     for table in score_tables(results):
         print_table(table)
-    remark(f"{OTHER}; {SCORES[_score(results)]}", quiet=quiet)
+    notes = [OTHER, SCORES[_score(results)], *([PRIVILEGED] if results[0].privileged else [])]
+    remark("; ".join(notes), quiet=quiet)
 
 
 def _protocols(progress: StageProgress) -> list[str]:

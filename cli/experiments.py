@@ -160,7 +160,7 @@ def _document(report: "ExperimentReport") -> dict[str, Any]:
 
 def result_tables(environment: str, results: Sequence["RunResult"]) -> list["Table"]:
     """One table per protocol: what every method reaches across seeds, and under others' contexts."""
-    from tcmrl_algo import summarize
+    from tcmrl_algo import by_method, summarize
 
     here = [result for result in results if result.environment == environment]
     columns = ("method", "seeds", "mean", "95%", "other", "regret")
@@ -168,8 +168,8 @@ def result_tables(environment: str, results: Sequence["RunResult"]) -> list["Tab
     for protocol in here[0].evaluations:
         title = f"{environment}, protocol {protocol}: returns on the test tasks"
         table = make_table(title, columns=columns, long_text=("method",))
-        for method in dict.fromkeys(result.method for result in here):
-            rows = [row for result in here if result.method == method for row in result.rows()]
+        for method, runs in by_method(here).items():
+            rows = [row for result in runs for row in result.rows()]
             chosen = [row for row in rows if row["protocol"] == protocol]
             final = summarize([row["final"] for row in chosen])
             interval = "–" if final.low is None else f"{number(final.low)} to {number(final.high)}"

@@ -18,6 +18,7 @@ from .experiment.driver import ExperimentReport as ExperimentReport
 from .experiment.driver import Finished as Finished
 from .experiment.driver import run_experiment as run_experiment
 from .experiment.results import RunResult as RunResult
+from .experiment.results import by_method as by_method
 from .methods.base import METHODS as METHODS
 from .methods.base import Algorithm as Algorithm
 from .methods.base import Capabilities as Capabilities

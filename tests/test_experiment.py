@@ -122,6 +122,7 @@ def test_long_returns_with_intervals_fit_a_terminal(
             update={
                 "method": "TCMRL without anything that the paper adds to its predecessors",
                 "seed": seed,
+                "privileged": True,
                 "evaluations": {"a_new_protocol": result.evaluations["paper"] | far},
             }
         )
@@ -132,6 +133,7 @@ def test_long_returns_with_intervals_fit_a_terminal(
     print_table(table)
     output = capsys.readouterr().out
     assert_fits(output)
+    assert "(privileged)" in output
     assert "-1,234.56 to -1,234.56" in output and "9,876.54" in output
 
 

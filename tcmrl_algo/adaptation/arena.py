@@ -3,7 +3,8 @@
 from collections.abc import Callable, Sequence
 from typing import final
 
-from tcmrl_algo.methods.base import Algorithm
+from tcmrl_algo.methods.base import Algorithm, Capabilities
+from tcmrl_algo.methods.privileged import TaskParameters
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_data import (
     Controller,
@@ -11,6 +12,7 @@ from tcmrl_data import (
     Lanes,
     Purpose,
     Task,
+    TrainingError,
     Trajectory,
     keyed_generator,
     keyed_seed,
@@ -39,6 +41,7 @@ class Arena:
         dataset: names environment and tasks, and holds stored trajectories.
         algorithm: the trained method.
         settings: `[training.run]`.
+        capabilities: of the method; tell whether it needs trajectories, and may see task parameters.
         seed: the run's; addresses resets, noise and drawn contexts.
         report: called with stage, episodes done and episodes to do, as episodes end.
     """
@@ -49,11 +52,14 @@ class Arena:
         algorithm: Algorithm,
         settings: RunSettings,
         *,
+        capabilities: Capabilities,
         seed: int,
         report: ProgressCallback = ignore_progress,
     ) -> None:
         self.dataset, self.settings = dataset, settings
         self._algorithm, self._seed, self._report = algorithm, seed, report
+        self._capabilities = capabilities
+        self._parameters = TaskParameters(dataset.train_tasks) if capabilities.privileged else None
         self._stage, self._done, self._total = "", 0, 0
         self._lanes: tuple[tuple[int, ...], Lanes] | None = None
         self._stored: dict[int, list[Trajectory]] = {}
@@ -65,11 +71,16 @@ class Arena:
     def adapted(
         self, tasks: Sequence[Task], contexts: Sequence[Context], *, episode: int
     ) -> list[Trajectory]:
-        """One episode per lane by the policy adapted to that lane's context; lanes may repeat tasks."""
+        """One episode per lane by the policy adapted to that lane's context; lanes may repeat tasks.
+
+        Raises:
+            TrainingError: a context without trajectories, for a method that needs some.
+        """
+        self._check_contexts(tasks, contexts)
         found: list[Trajectory] = []
         for start in range(0, len(tasks), MOST_LANES):
             lanes = slice(start, start + MOST_LANES)
-            controller = self._algorithm.adapt(contexts[lanes])
+            controller = self._adapt(tasks[lanes], contexts[lanes])
             found += self._run(tasks[lanes], controller, episode=episode, first_lane=start)
         return found
 
@@ -95,6 +106,23 @@ class Arena:
         if self._lanes is not None:
             self._lanes[1].close()
         self._lanes = None
+
+    def _check_contexts(self, tasks: Sequence[Task], contexts: Sequence[Context]) -> None:
+        if not self._capabilities.needs_trajectories:
+            return
+        for task, context in zip(tasks, contexts, strict=True):
+            if not context:
+                raise TrainingError(
+                    f"{self.settings.algorithm} cannot adapt to task {task.index} without a trajectory, and "
+                    f"the protocol {self.settings.protocol} has none; set run.random_episodes to 1 or more, "
+                    "or choose another --protocol"
+                )
+
+    def _adapt(self, tasks: Sequence[Task], contexts: Sequence[Context]) -> Controller:
+        """The adapted policy; task parameters reach no method without the capability to see them."""
+        if self._parameters is None:
+            return self._algorithm.adapt(contexts)
+        return self._algorithm.adapt(contexts, privileged=self._parameters(tasks))
 
     def _lanes_of(self, tasks: Sequence[Task]) -> Lanes:
         """Lanes of these tasks; the last ones are kept, since adaptation steps the same tasks again."""

@@ -14,6 +14,7 @@ from tcmrl_algo.adaptation.arena import Arena, Context, ProgressCallback, ignore
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS, Adaptation
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_algo.training.checkpoint import Run, open_run
+from tcmrl_algo.training.config import method_of
 from tcmrl_algo.training.metrics import log_evaluation
 from tcmrl_algo.training.train import create_algorithm
 from tcmrl_data import Dataset, Task, TrainingError, Trajectory
@@ -37,7 +38,10 @@ class TaskResult:
         normalized: (final - random) / (best - random), best being the return of the reference.
         reference: what `normalized` is 1 at: the `oracle` or, without one, the best `behavior` policy.
         success: share of final episodes that succeed, or None where the environment does not say.
-        shuffled: mean return of the same policy under other tasks' contexts.
+        shuffled: mean return of the same policy under other tasks' contexts. A policy that adapts within
+            an episode begins with the other task's belief and goes on from it by what it observes, so that
+            this tells how well it corrects a wrong belief. A privileged policy keeps the parameters of the
+            task itself.
     """
 
     task: int
@@ -55,7 +59,10 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How a run does on all test tasks; means are over them, None where a task has no value."""
+    """How a run does on all test tasks; means are over them, None where a task has no value.
+
+    `privileged` marks a control that saw the tasks' parameters.
+    """
 
     algorithm: str
     environment: str
@@ -66,6 +73,7 @@ class Evaluation:
     mean_regret: float | None
     mean_normalized: float | None
     mean_shuffled: float
+    privileged: bool
 
     def to_json(self) -> dict[str, Any]:
         """The document of `tcmrl evaluate --json`."""
@@ -126,7 +134,9 @@ def evaluate_open_run(
     on_cpu = run.record.model_copy(update={"device": "cpu"})  # the run's own may be another machine's
     algorithm = create_algorithm(on_cpu, dataset)
     algorithm.load_tensors(run.newest().tensors())
-    arena = Arena(dataset, algorithm, settings, seed=run.record.seed, report=report)
+    method, _ = method_of(run.record.config)
+    seed = run.record.seed
+    arena = Arena(dataset, algorithm, settings, capabilities=method.capabilities, seed=seed, report=report)
     try:
         arena.begin("adaptation", len(tasks) * settings.episodes)
         adaptations = protocol.adapt(arena, tasks)
@@ -138,13 +148,14 @@ def evaluate_open_run(
     return Evaluation(
         algorithm=settings.algorithm,
         environment=dataset.name,
-        seed=run.record.seed,
+        seed=seed,
         protocol=settings.protocol,
         tasks=results,
         mean_final=fmean(each.final for each in results),
         mean_regret=_mean(regrets),
         mean_normalized=_mean(scores),
         mean_shuffled=fmean(each.shuffled for each in results),
+        privileged=run.record.privileged or method.capabilities.privileged,
     )
 
 
@@ -182,14 +193,14 @@ def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) 
     """As many contexts of other tasks as the task has of its own; at least one of each lender.
 
     Up to MOST_OTHERS other test tasks, evenly spaced, lend in turn what they were adapted by, unless the
-    task was adapted by the same (two may keep one training task's context under `idaq`). Where none is
-    left, training tasks lend stored trajectories.
+    task was adapted by the same (two may keep one training task's context under `idaq`), or it holds no
+    trajectory (the prior is no task's). Where nobody is left, training tasks lend stored trajectories.
     """
     num_own = len(own[task.index])
-    of_task = {_key(context) for context in own[task.index]}
+    excluded = {_key(context) for context in own[task.index]} | {()}
 
     def foreign(lenders: Iterable[list[Context]]) -> list[list[Context]]:
-        return [contexts for contexts in lenders if of_task.isdisjoint(map(_key, contexts))]
+        return [contexts for contexts in lenders if excluded.isdisjoint(map(_key, contexts))]
 
     others = foreign(contexts for index, contexts in own.items() if index != task.index)
     if not others:

@@ -141,6 +141,7 @@ def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: Mapping[str, E
             include={"experiment", "method", "environment", "seed", "profile", "dataset", "root"}
         ),
         algorithm=job.config.settings.run.algorithm,
+        privileged=run.record.privileged,
         steps=steps,
         device=run.record.device,
         threads=run.record.config.settings.run.threads,

@@ -16,6 +16,7 @@ COLUMNS = (
     "environment",
     "method",
     "algorithm",
+    "privileged",
     "seed",
     "protocol",
     "final",
@@ -66,6 +67,7 @@ class RunResult(_Record):
 
     Attributes:
         experiment, method, algorithm, environment, seed, profile: which run this is.
+        privileged: whether the method is a control that sees task parameters.
         dataset, root: the dataset and its Merkle root.
         steps, device, threads: of training; results depend on device and threads in their last bits.
         identity: everything that the result is a function of, beside the code.
@@ -84,6 +86,7 @@ class RunResult(_Record):
     experiment: str
     method: str
     algorithm: str
+    privileged: bool
     environment: str
     seed: int
     profile: str
@@ -123,10 +126,14 @@ def table_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = COLUM
 
 
 def by_method(results: Iterable[RunResult]) -> dict[str, list[RunResult]]:
-    """Results of every method, in the order given."""
+    """Results of every method, in the order given, by its label as tables and figures show it.
+
+    The label of a control that sees task parameters says so.
+    """
     found: dict[str, list[RunResult]] = {}
-    for each in results:
-        found.setdefault(each.method, []).append(each)
+    for result in results:
+        label = f"{result.method} (privileged)" if result.privileged else result.method
+        found.setdefault(label, []).append(result)
     return found
 
 

@@ -186,6 +186,7 @@ def _evaluated(label: str, run: Run, place: str | None) -> RunResult:
         experiment="runs",
         method=label,
         algorithm=record.config.settings.run.algorithm,
+        privileged=record.privileged,
         environment=record.environment,
         seed=record.seed,
         profile=record.profile,

@@ -25,7 +25,8 @@ class RunSettings(BaseModel):
         checkpoint_every: steps between two checkpoints.
         protocol: how to adapt to test tasks (paper, section 4.2: `paper`).
         episodes: adaptation episodes per test task.
-        random_episodes: how many of them act uniformly, under `paper`.
+        random_episodes: how many of them act uniformly, under `paper`; 0 begins with the prior of a method
+            that needs no trajectories.
         offline_trajectories: stored trajectories that make one context, under `offline`.
         final_episodes: episodes of the adapted policy that its final return averages over.
     """
@@ -42,6 +43,6 @@ class RunSettings(BaseModel):
     checkpoint_every: int = Field(default=5_000, ge=1)
     protocol: str = "paper"
     episodes: int = Field(default=10, ge=1)
-    random_episodes: int = Field(default=2, ge=1)
+    random_episodes: int = Field(default=2, ge=0)
     offline_trajectories: int = Field(default=4, ge=1)
     final_episodes: int = Field(default=1, ge=1)

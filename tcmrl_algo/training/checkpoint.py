@@ -35,6 +35,7 @@ class RunRecord(BaseModel):
         steps: how far to train.
         device: where.
         config: the resolved configuration.
+        privileged: whether the method is a control that sees task parameters.
         moments: statistics of the data trained on.
         versions: packages that results depend on.
     """
@@ -50,6 +51,7 @@ class RunRecord(BaseModel):
     steps: int = Field(ge=1)
     device: str
     config: TrainingConfig
+    privileged: bool
     moments: MomentsRecord
     versions: dict[str, str]
 

@@ -139,6 +139,7 @@ def train_run(
         steps=config.settings.run.steps if steps is None else steps,
         device=device,
         config=config,
+        privileged=method_of(config)[0].capabilities.privileged,
         moments=MomentsRecord.of(batches.moments()),
         versions={name: importlib.metadata.version(name) for name in PACKAGES},
     )
