@@ -116,7 +116,8 @@ def plan(
         "stored environment steps": f"{planned.rollout_steps:,} at most",
         "size": f"{size(planned.bytes)} at most",
         "memory": f"{size(planned.unit_bytes)} per worker at most",
-        "time": f"about {duration(planned.seconds)} with {planned.workers} workers",
+        "time": f"about {duration(planned.seconds)} ({duration(planned.seconds_low)} to "
+        f"{duration(planned.seconds_high)}) with {planned.workers} workers",
     }
     for name, value in rows.items():
         table.add_row(name, value)

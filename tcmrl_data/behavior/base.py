@@ -69,6 +69,15 @@ class BehaviorSource(abc.ABC):
         """Task indices per unit: tasks whose indices give the same quotient by it are trained together."""
         return 1
 
+    @property
+    def warmup_steps(self) -> int:
+        """Environment steps of a task before its first update."""
+        return 0
+
+    def with_warmup(self, steps: int) -> "BehaviorSource":
+        """This source with a warm-up of at most so many steps, so that a forecast soon sees updates."""
+        return self
+
     @abc.abstractmethod
     def training_bytes(self, environment: Environment, num_tasks: int) -> int:
         """Most memory that training `num_tasks` tasks takes, beside the process and the simulators."""

@@ -78,6 +78,14 @@ class SacSource(BehaviorSource):
     def training_steps(self) -> int:
         return self.settings.steps
 
+    @property
+    def warmup_steps(self) -> int:
+        return self.settings.warmup
+
+    def with_warmup(self, steps: int) -> "SacSource":
+        warmup = min(steps, self.settings.warmup)
+        return SacSource(self.settings.model_copy(update={"warmup": warmup}))
+
     def training_bytes(self, environment: Environment, num_tasks: int) -> int:
         return training_bytes(self.settings, environment, num_agents=1)
 

@@ -62,6 +62,14 @@ class StackedSource(BehaviorSource):
     def group_size(self) -> int:
         return self.settings.group
 
+    @property
+    def warmup_steps(self) -> int:
+        return self.settings.warmup
+
+    def with_warmup(self, steps: int) -> "StackedSource":
+        warmup = min(steps, self.settings.warmup)
+        return StackedSource(self.settings.model_copy(update={"warmup": warmup}))
+
     def training_bytes(self, environment: Environment, num_tasks: int) -> int:
         return training_bytes(self.settings, environment, num_agents=num_tasks)
 
