@@ -160,15 +160,10 @@ def train(
 def _config(
     dataset: "Dataset", *, algo: str | None, profile: Profile | None, overrides: Sequence[str]
 ) -> "TrainingConfig":
-    from tcmrl_algo import resolve
+    from tcmrl_algo import resolve_for
 
     chosen = profile or dataset.manifest.profile
-    table = dataset.manifest.training.get(chosen)
-    if table is None:
-        known = ", ".join(dataset.manifest.training)
-        raise click.UsageError(f"{dataset.folder} has no training table {chosen!r}; known are {known}.")
-    place = f"training table of {dataset.name!r}, profile {chosen!r}"
-    return resolve(table, place=place, algorithm=algo, overrides=overrides)
+    return resolve_for(dataset, profile=chosen, algorithm=algo, overrides=overrides)
 
 
 def _train(

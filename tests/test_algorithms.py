@@ -1,12 +1,15 @@
 """What every method keeps: determinism, stages, tensors, adaptation as its capabilities say."""
 
 import inspect
+import json
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
+from tcmrl_cli.train import tcmrl
 from torch import Tensor
 
 from tcmrl_algo.methods.base import METHODS, Algorithm, Method
@@ -14,6 +17,7 @@ from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.methods.stages import StagePlan
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, Controller, Steps, Trajectory, Transition, UniformController
+from tests.commands import in_process
 from tests.made_up import ACTION_DIM, OBSERVATION_DIM, TASKS, batch_for, problem, settings, trajectory
 
 STEPS = 6
@@ -219,3 +223,34 @@ def without_rewards(values: Steps) -> Steps:
 def test_tasks_of_a_batch_are_found_among_the_training_tasks() -> None:
     assert TASKS == 3
     assert problem().position(torch.tensor([9, 2])).tolist() == [2, 0]
+
+
+@pytest.mark.parametrize("name", [name for name in METHODS.names() if name.startswith("double")])
+def test_a_method_of_another_package_trains_resumes_and_evaluates_by_the_command_line(
+    name: str, tiny_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call, settings = (
+        in_process(tcmrl, capsys),
+        ["batch.transitions=8", "actor_critic.hidden=[8]", "run.log_every=1"],
+    )
+    common = ["train", tiny_folder, "--algo", name, "--json", "--set", "run.steps=8"]
+    common += [text for value in settings for text in ("--set", value)]
+    digests = []
+    for folder, stops in (("straight", (8,)), ("stopped", (3, 8))):
+        for stop in stops:
+            more = ["--steps", stop, "--out", tmp_path / folder]
+            resumed = ["train", tiny_folder, "--resume", "--json", *more]
+            code, output, errors = call(*(resumed if stop != stops[0] else [*common, *more]))
+            assert code == 0, errors
+        digests.append(json.loads(output)["digest"])
+    assert digests[0] == digests[1]  # stopped in the middle of a stage
+    lines = (tmp_path / "straight/metrics.jsonl").read_text().splitlines()
+    stages = {json.loads(line)["stage"] for line in lines}
+    assert stages == ({"model", "encoder", "policy"} if name == "double_stages" else {"train"})
+    code, output, errors = call(
+        "evaluate", tmp_path / "straight", "--json", "--protocol", "paper", "--episodes", 3
+    )
+    assert code == 0, errors
+    (document,) = found if isinstance(found := json.loads(output), list) else [found]
+    assert document["algorithm"] == name
+    assert document["privileged"] is METHODS.get(name).capabilities.privileged

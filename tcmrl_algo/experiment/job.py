@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict
 from tcmrl_algo.adaptation.evaluate import Evaluation, evaluate_run
 from tcmrl_algo.experiment.results import CurvePoint, RunResult, result_file
 from tcmrl_algo.training.checkpoint import digest, open_run
-from tcmrl_algo.training.config import TrainingConfig
+from tcmrl_algo.training.config import TrainingConfig, stage_plan
 from tcmrl_algo.training.train import Progress, resume_run, train_run
 from tcmrl_data import CheckpointError, Dataset, open_dataset
 from tcmrl_data.engine.worker import Send, serve
@@ -80,6 +80,7 @@ def run_job(job: Job, report: Send) -> str:
     file = folder / "curve.json"
     curve = read_record(Curve, file).points if file.is_file() else ()
     evaluations: dict[str, Evaluation] = {}
+    stages = stage_plan(job.config)
     for step in job.points()[len(curve) :]:
         timed_steps, seconds = _train_to(step, job, dataset, report)
         began = time.perf_counter()
@@ -88,6 +89,7 @@ def run_job(job: Job, report: Send) -> str:
         first = evaluations[job.protocols[0]]
         point = CurvePoint(
             step=step,
+            stage=stages.at(step).stage,
             **{name: getattr(first, f"mean_{name}") for name in MEANS},
             timed_steps=timed_steps,
             seconds=seconds,

@@ -7,7 +7,7 @@ from typing import Any
 
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.experiment.config import EnvironmentChoice, Experiment, override_texts, run_id
-from tcmrl_algo.training.config import TrainingConfig, resolve
+from tcmrl_algo.training.config import TrainingConfig, installed_table, resolve
 from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError, open_dataset
 
 
@@ -145,6 +145,7 @@ def resolve_method(
     label: str,
     place: str,
     steps: int | None = None,
+    fallback: Mapping[str, Any] | None = None,
 ) -> TrainingConfig:
     """A method's configuration: the training table, then changes of experiment, environment and method.
 
@@ -156,7 +157,7 @@ def resolve_method(
     texts = [text for each in changes for text in override_texts(each)]
     if steps is not None:
         texts.append(f"run.steps={steps}")
-    config = resolve(table, place=place, algorithm=method.algorithm, overrides=texts)
+    config = resolve(table, place=place, algorithm=method.algorithm, overrides=texts, fallback=fallback)
     if config.settings.run.steps < experiment.curve_points:
         raise TrainingError(
             f"{place}: {experiment.curve_points} curve_points need as many steps, not "
@@ -174,7 +175,13 @@ def _config(
         known = ", ".join(dataset.manifest.training)
         raise TrainingError(f"{place}: the dataset has no such training table; it has {known}")
     config = resolve_method(
-        experiment, table, environment=dataset.name, label=label, place=place, steps=steps
+        experiment,
+        table,
+        environment=dataset.name,
+        label=label,
+        place=place,
+        steps=steps,
+        fallback=installed_table(dataset.name, profile),
     )
     for rule in (config.settings.run.snapshots, config.settings.run.context_snapshots):
         if rule is not None:

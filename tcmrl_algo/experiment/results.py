@@ -43,6 +43,7 @@ class CurvePoint(_Record):
 
     Attributes:
         step: training steps done.
+        stage: of training, at that step.
         final, regret, normalized, shuffled: means over test tasks under the experiment's first protocol.
         timed_steps, seconds: of training since the last point, as far as this process did it.
         evaluation_seconds: of all evaluation at this point.
@@ -51,6 +52,7 @@ class CurvePoint(_Record):
     """
 
     step: int
+    stage: str = "train"
     final: float
     regret: float | None
     normalized: float | None

@@ -113,16 +113,17 @@ def resolve_for(
         place=f"training table of {dataset.name!r}, profile {profile!r}",
         algorithm=algorithm,
         overrides=overrides,
-        fallback=_installed(dataset.name, profile),
+        fallback=installed_table(dataset.name, profile),
     )
 
 
-def _installed(environment: str, profile: Profile) -> Mapping[str, Any]:
+def installed_table(environment: str, profile: str) -> Mapping[str, Any]:
     """The training table of an environment's installed recipe; empty where there is none of that profile."""
     try:
-        return load_recipe(environment, profile=profile).training[profile]
-    except (UnknownNameError, RecipeError, KeyError):  # a user's recipe file, or one without that profile
+        tables = load_recipe(environment).training
+    except (UnknownNameError, RecipeError):  # built by a user's recipe file
         return {}
+    return {str(name): table for name, table in tables.items()}.get(profile, {})
 
 
 def method_of(config: TrainingConfig) -> tuple[Method[Any], Any]:
