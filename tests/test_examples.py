@@ -54,6 +54,13 @@ class Installation:
         return _run(self.scripts / program, *arguments)
 
 
+SHORT = (
+    "run.log_every=5",
+    "run.episodes=3",
+    "run.final_episodes=1",
+    "run.random_episodes=1",
+    "actor_critic.hidden=[8]",
+)
 OFFLINE = ("--quiet", "--no-deps", "--no-index")
 
 
@@ -88,7 +95,8 @@ def installation(tmp_path_factory: pytest.TempPathFactory) -> Installation:
     made = Installation(tmp_path_factory.mktemp("installation"))
     made.install(ROOT)
     made.install(ROOT / "examples" / "pendulum")
-    declares = {f"tcmrl.{group}": "defect = tcmrl_defect:Plugin" for group in ("environments", "formats")}
+    groups = ("environments", "algorithms", "formats")
+    declares = {f"tcmrl.{group}": "defect = tcmrl_defect:Plugin" for group in groups}
     source = {"tcmrl_defect": "raise OSError('no such licence')"}
     install(made.site, "tcmrl-defect", modules=source, declares=declares)
     return made
@@ -110,6 +118,16 @@ def test_the_environment_of_a_users_package_is_built_and_verified(
     assert [sorted(task["parameters"]) for task in tasks] == [["gravity", "length", "mass"]] * 4
     document = json.loads(installation.call("tcmrl-data", "verify", pendulum, "--replay", 1, "--json"))
     assert document["findings"] == []
+
+
+def test_the_method_of_a_users_package_is_trained_and_evaluated(
+    installation: Installation, pendulum: Path, tmp_path: Path
+) -> None:
+    options = ["--algo", "reward_regression", "--steps", 10, "--quiet", *_set(SHORT)]
+    installation.call("tcmrl", "train", pendulum, *options, "--out", tmp_path / "run")
+    document = json.loads(installation.call("tcmrl", "evaluate", tmp_path / "run", "--json"))
+    assert document["algorithm"] == "reward_regression"
+    assert np.isfinite(document["mean_final"])
 
 
 def test_the_format_of_a_users_package_holds_every_episode(

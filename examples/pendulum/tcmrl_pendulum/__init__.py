@@ -1,1 +1,1 @@
-"""Plug-ins for tcmrl: a pendulum whose physics differ from task to task, and NumPy archives."""
+"""Plug-ins for tcmrl: a pendulum whose physics differ from task to task, a method, and NumPy archives."""
