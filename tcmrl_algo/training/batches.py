@@ -1,13 +1,26 @@
 """The stream of batches that a run learns from; contexts may come from other snapshots than transitions."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Protocol, final, runtime_checkable
 
 import torch
 
 from tcmrl_algo.methods.stages import StagePlan
 from tcmrl_algo.settings.run import RunSettings
-from tcmrl_data import Batch, BatchRequest, Dataset, Moments, Sampler, Transitions, open_sampler
+from tcmrl_data import (
+    Batch,
+    BatchRequest,
+    Dataset,
+    Moments,
+    Sampler,
+    Trajectories,
+    Transitions,
+    Windows,
+    open_sampler,
+)
+
+Kind = Transitions | Trajectories | Windows
 
 
 @runtime_checkable
@@ -60,18 +73,21 @@ def open_batches(
         )
 
     requests = [stage.request for stage in stages]
-    first, transitions = requests[0], only_transitions(requests[0])
-    reads_contexts = any(request != only_transitions(request) for request in requests)
+    transitions, contexts = split_request(requests[0])
+    reads_contexts = any(split_request(request)[1].kinds for request in requests)
     if run.context_snapshots is None or not reads_contexts:
-        return StagedBatches(sampler(run.snapshots, first), stages)
-    contexts = sampler(run.context_snapshots, first)
-    return StagedBatches(JoinedBatches(sampler(run.snapshots, transitions), contexts), stages)
+        return StagedBatches(sampler(run.snapshots, requests[0]), stages)
+    joined = JoinedBatches(sampler(run.snapshots, transitions), sampler(run.context_snapshots, contexts))
+    return StagedBatches(joined, stages)
 
 
-def only_transitions(request: BatchRequest) -> BatchRequest:
-    """The request's kinds of transitions alone."""
-    kinds = {name: kind for name, kind in request.kinds.items() if isinstance(kind, Transitions)}
-    return BatchRequest(request.tasks, kinds)
+def split_request(request: BatchRequest) -> tuple[BatchRequest, BatchRequest]:
+    """The request's transitions, and its trajectories and windows; no draw depends on the other half."""
+    halves: tuple[dict[str, Kind], dict[str, Kind]] = ({}, {})
+    for name, kind in request.kinds.items():
+        halves[not isinstance(kind, Transitions)][name] = kind
+    transitions, contexts = (replace(request, kinds=half) for half in halves)
+    return transitions, contexts
 
 
 @final
@@ -91,12 +107,14 @@ class JoinedBatches:
         found = self._contexts.batch(n)
         transitions = self._transitions.batch(n)
         assert torch.equal(found.task_indices, transitions.task_indices)
-        return Batch(found.task_indices, {**found.steps, **transitions.steps})
+        return Batch(found.task_indices, {**transitions.steps, **found.steps})
 
     def with_request(self, request: BatchRequest) -> "JoinedBatches":
         """Batches of another request from the same snapshots."""
-        transitions = self._transitions.with_request(only_transitions(request))
-        return JoinedBatches(transitions, self._contexts.with_request(request))
+        transitions, contexts = split_request(request)
+        return JoinedBatches(
+            self._transitions.with_request(transitions), self._contexts.with_request(contexts)
+        )
 
     def moments(self) -> Moments:
         """Statistics over the actor-critic's transitions."""

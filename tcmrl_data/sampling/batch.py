@@ -23,6 +23,12 @@ class Steps:
         next_observations: (..., observation_dim).
         terminated: (...,) float, 1 where the task ended the episode; a time limit is 0.
         mask: (...,) bool, False on padding.
+        returns_to_go: (...,) sum over k of gamma^k r_{t+k} to the episode's end, whatever ended it.
+        discounts_to_end: (...,) gamma^(T - t), which weighs the value of the final observation.
+        final_observations: (..., observation_dim) s_T.
+        times: (...,) int64, t.
+
+    The last four are None unless the kind was requested with `returns=True`.
     """
 
     observations: Tensor
@@ -31,6 +37,10 @@ class Steps:
     next_observations: Tensor
     terminated: Tensor
     mask: Tensor
+    returns_to_go: Tensor | None = None
+    discounts_to_end: Tensor | None = None
+    final_observations: Tensor | None = None
+    times: Tensor | None = None
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,17 @@
 """Which rows make batch n: index arithmetic alone, for several batches at a time."""
 
+import hashlib
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.sampling.request import BatchRequest, Trajectories, Windows
+from tcmrl_data.sampling.orders import Uniform, below, fill_places, places_filled, read_end
+from tcmrl_data.sampling.request import BatchRequest, Trajectories
 from tcmrl_data.sampling.rows import Episodes, Indices
 
-Uniform = npt.NDArray[np.float64]
+Key = npt.NDArray[np.unsignedinteger[Any]]
 
 BLOCK = 16
 """Batches whose indices are computed together; they come from one run of the counter."""
@@ -68,36 +70,48 @@ class Starts:
             result: Indices = self.first_rows[drawn]
             result += places.astype(np.int64)
             return result
-        numbers = first + _below(uniform, last - first)
+        numbers = first + below(uniform, last - first)
         episodes = np.searchsorted(self.before, numbers, side="right") - 1
         result = self.first_rows[episodes] + (numbers - self.before[episodes])
         return result
 
 
 class Draws:
-    """Draws batches from the episodes of the tasks; batch n is a pure function of (key, n).
+    """Draws batches from the episodes of the tasks; batch n is a pure function of (sequence, n).
+
+    Tasks and every kind draw from counter-based generators of their own (Philox; Salmon et al., 2011), a
+    kind's keyed by its name.
 
     Args:
         episodes: what there is.
         request: what a batch takes; at most as many tasks as there are.
-        key: (2,) uint64 of the counter-based generator (Philox; Salmon et al., 2011).
+        sequence: addresses the stream of batches.
     """
 
     def __init__(
-        self, episodes: Episodes, request: BatchRequest, *, key: npt.NDArray[np.unsignedinteger[Any]]
+        self, episodes: Episodes, request: BatchRequest, *, sequence: np.random.SeedSequence
     ) -> None:
-        self._key, self._episode_ranges = key, episodes.task_ranges
-        kinds = request.kinds.items()
-        self._trajectories = {name: kind for name, kind in kinds if isinstance(kind, Trajectories)}
-        stretches = [(name, kind) for name, kind in kinds if not isinstance(kind, Trajectories)]
-        stretches.sort(key=lambda item: isinstance(item[1], Windows))
-        self._starts = {name: (kind.number, Starts.of(episodes, kind.length)) for name, kind in stretches}
+        self._ranges, self._task_key = episodes.task_ranges, _key(sequence)
+        self._starts: dict[str, tuple[Key, int, Starts]] = {}
+        self._ends: dict[str, tuple[Key, Trajectories]] = {}
+        self._orders: dict[str, tuple[Key, int]] = {}
+        most_episodes = int(np.diff(episodes.task_ranges).max())
+        for name, kind in request.kinds.items():
+            key = _key(sequence, name, "numbers")
+            if isinstance(kind, Trajectories):
+                self._ends[name] = (key, kind)
+                order, needed = _order_of(name, kind)
+                _, places = self._orders.get(order, (key, 0))
+                places = min(max(places, needed), most_episodes)
+                self._orders[order] = (_key(sequence, order, "order"), places)
+            else:
+                self._starts[name] = (key, kind.number, Starts.of(episodes, kind.length))
         self.num_tasks = min(request.tasks, len(episodes.task_ranges))
         self._block: tuple[int, list[Draw]] = (-1, [])
 
     def num_starts(self, name: str) -> Indices:
         """(tasks,) valid transitions or windows of each task."""
-        result: Indices = np.diff(self._starts[name][1].task_ranges)[:, 0]
+        result: Indices = np.diff(self._starts[name][2].task_ranges)[:, 0]
         return result
 
     def __call__(self, n: int) -> Draw:
@@ -110,44 +124,38 @@ class Draws:
 
     def _make(self, number: int) -> list[Draw]:
         """The batches number * BLOCK, …, from uniform numbers in [0, 1) of 53 bits."""
-        random = np.random.Generator(np.random.Philox(key=self._key, counter=[0, 0, 0, number]))
-        order = random.random((BLOCK, len(self._episode_ranges))).argsort(axis=1)
-        tasks: Indices = order[:, : self.num_tasks].astype(np.int64)
-        chosen = random.random(BLOCK)
-        shape = (BLOCK, self.num_tasks)
-        picks = {
-            name: list(starts.draw(tasks, random.random((*shape, count))))
-            for name, (count, starts) in self._starts.items()
+        uniform = _generator(self._task_key, number).random((BLOCK, len(self._ranges)))
+        tasks: Indices = uniform.argsort(axis=1)[:, : self.num_tasks].astype(np.int64)
+        picks: dict[str, list[Indices]] = {}
+        for name, (key, count, starts) in self._starts.items():
+            random = _generator(key, number)
+            picks[name] = list(starts.draw(tasks, random.random((*tasks.shape, count))))
+        first, last = np.moveaxis(self._ranges[tasks], -1, 0)
+        counts = last - first
+        orders = {
+            name: fill_places(counts, _generator(key, number).random((places, *tasks.shape)))
+            for name, (key, places) in self._orders.items()
         }
-        most = sum(kind.number for kind in self._trajectories.values())
-        episodes = distinct(self._episode_ranges[tasks], random.random((*shape, most)))
-        first = np.zeros(BLOCK, dtype=np.int64)
-        for name, kind in self._trajectories.items():
-            last = first + np.array(kind.numbers)[_below(chosen, len(kind.numbers))]
-            picks[name] = [episodes[i, :, first[i] : last[i]] for i in range(BLOCK)]
-            first = last
+        for name, (key, kind) in self._ends.items():
+            filled = orders[_order_of(name, kind)[0]]
+            episodes = read_end(filled, counts, kind.number, from_back=kind.apart_from is not None)
+            episodes += first[..., None]
+            chosen = below(_generator(key, number).random(BLOCK), len(kind.numbers))
+            picks[name] = [episodes[i, :, : kind.numbers[chosen[i]]] for i in range(BLOCK)]
         return [Draw(tasks[i], {name: found[i] for name, found in picks.items()}) for i in range(BLOCK)]
 
 
-def distinct(ranges: Indices, uniform: Uniform) -> Indices:
-    """(..., count) integers, uniform without replacement within each [first, last).
-
-    Args:
-        ranges: (..., 2).
-        uniform: (..., count) in [0, 1); the k-th picks among what the first k - 1 left.
-    """
-    count = uniform.shape[-1]
-    picks = np.zeros(uniform.shape, dtype=np.int64)
-    for j in range(count):
-        pick = _below(uniform[..., j], ranges[..., 1] - ranges[..., 0] - j)
-        for k in range(j):  # step over what is taken, smallest first
-            pick += pick >= np.sort(picks[..., :j], axis=-1)[..., k]
-        picks[..., j] = pick
-    result: Indices = picks + ranges[..., :1]
-    return result
+def _order_of(name: str, kind: Trajectories) -> tuple[str, int]:
+    """The kind whose order of episodes a kind reads, and how many of its places must be filled."""
+    return kind.apart_from or name, places_filled(kind.number, from_back=kind.apart_from is not None)
 
 
-def _below(uniform: Uniform, counts: Indices | int) -> Indices:
-    """Integers below the counts; the product of a float below 1 and a count never rounds up to the count."""
-    result: Indices = (uniform * counts).astype(np.int64)
-    return result
+def _key(sequence: np.random.SeedSequence, *names: str) -> Key:
+    """The generator's key of a purpose under the stream of batches."""
+    entries = [int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big") for name in names]
+    own = np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, *entries))
+    return own.generate_state(2, np.uint64)
+
+
+def _generator(key: Key, block: int) -> np.random.Generator:
+    return np.random.Generator(np.random.Philox(key=key, counter=[0, 0, 0, block]))

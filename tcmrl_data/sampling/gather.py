@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tcmrl_data.sampling.batch import Batch, Steps
 from tcmrl_data.sampling.draws import Draw
+from tcmrl_data.sampling.endings import Endings
 from tcmrl_data.sampling.request import BatchRequest, Kind, Trajectories, Transitions
 from tcmrl_data.sampling.rows import Indices, PackedRows, Table
 
@@ -54,12 +55,20 @@ class Gatherer:
         request: what a batch holds.
         num_tasks: tasks per batch.
         device: where batches are to be.
+        endings: of the rows, where a kind wants returns.
     """
 
     def __init__(
-        self, rows: PackedRows, table: Tensor, request: BatchRequest, *, num_tasks: int, device: torch.device
+        self,
+        rows: PackedRows,
+        table: Tensor,
+        request: BatchRequest,
+        *,
+        num_tasks: int,
+        device: torch.device,
+        endings: Endings | None = None,
     ) -> None:
-        self._rows, self._device, self._num_tasks = rows, device, num_tasks
+        self._rows, self._device, self._num_tasks, self._endings = rows, device, num_tasks, endings
         self._width: int = rows.table.shape[1]
         self._longest = rows.episodes.longest
         self._is_ragged = bool((rows.episodes.lengths != self._longest).any())
@@ -85,32 +94,41 @@ class Gatherer:
     def __call__(self, draw: Draw) -> Batch:
         """The batch of a draw, on the device."""
         memory = self._buffers.take()
-        masks = {name: self._gather(memory, block, draw.picks[name]) for name, block in self._blocks.items()}
+        rows = {name: self._first_rows(name, picks) for name, picks in draw.picks.items()}
+        masks = {name: self._gather(memory, block, rows[name]) for name, block in self._blocks.items()}
         memory = self._buffers.hand_out(memory)
         steps = {}
         for name, mask in masks.items():
-            layout = self._layout(name, draw.picks[name].shape[1])
+            layout = self._layout(name, rows[name].shape[1])
             found = layout if isinstance(layout, Steps) else _steps(memory, *layout)
-            steps[name] = found if mask is None else replace(found, mask=mask)
+            found = found if mask is None else replace(found, mask=mask)
+            if self._endings is not None and self._blocks[name].kind.returns:
+                found = self._endings.attach(found, rows[name])
+            steps[name] = found
         return Batch(torch.from_numpy(self._rows.task_indices[draw.tasks]), steps)
 
-    def _gather(self, memory: Tensor, block: _Block, picks: Indices) -> Tensor | None:
+    def _first_rows(self, name: str, picks: Indices) -> Indices:
+        is_trajectory = isinstance(self._blocks[name].kind, Trajectories)
+        return self._rows.episodes.starts[picks] if is_trajectory else picks
+
+    def _gather(self, memory: Tensor, block: _Block, rows: Indices) -> Tensor | None:
         """Copies a kind into the buffer; returns its mask where some of it is padding."""
-        is_trajectory = isinstance(block.kind, Trajectories)
-        rows = self._rows.episodes.starts[picks] if is_trajectory else picks
         floats = block.view.shape[1]
         out = memory[block.offset : block.offset + rows.size * floats].view(rows.size, floats)
         if rows.size:
             index = torch.from_numpy(rows.reshape(-1)).to(memory.device)
             torch.index_select(block.view, 0, index, out=out)
-        return self._clear_padding(out, picks) if is_trajectory and self._is_ragged else None
+        is_padded = isinstance(block.kind, Trajectories) and self._is_ragged
+        return self._clear_padding(out, rows) if is_padded else None
 
-    def _clear_padding(self, out: Tensor, episodes: Indices) -> Tensor:
+    def _clear_padding(self, out: Tensor, rows: Indices) -> Tensor:
         """(tasks, number, longest episode) mask; clears what was gathered beyond an episode."""
-        lengths = torch.from_numpy(self._rows.episodes.lengths[episodes]).to(out.device)[..., None]
+        episodes = self._rows.episodes
+        drawn = np.searchsorted(episodes.starts, rows)
+        lengths = torch.from_numpy(episodes.lengths[drawn]).to(out.device)[..., None]
         t = torch.arange(self._longest + 1, device=out.device)
-        rows = out.view(*episodes.shape, self._longest + 1, self._width)
-        rows.masked_fill_((t > lengths)[..., None], 0.0)
+        block = out.view(*rows.shape, self._longest + 1, self._width)
+        block.masked_fill_((t > lengths)[..., None], 0.0)
         return (t[:-1] < lengths).to(self._device)
 
     def _layout(self, name: str, number: int) -> _Fields | Steps:

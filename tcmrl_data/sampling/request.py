@@ -13,10 +13,12 @@ class Transitions:
 
     Attributes:
         number: transitions per task.
+        returns: whether steps carry their returns to go and what belongs to them.
     """
 
     length: ClassVar[int] = 1
     number: int
+    returns: bool = False
 
 
 @dataclass(frozen=True, init=False)
@@ -26,18 +28,24 @@ class Trajectories:
     Attributes:
         numbers: episodes per task; one of these numbers is drawn for every batch.
         apart_from: the kind of trajectories with which this one shares no episode of a batch.
+        returns: whether steps carry their returns to go and what belongs to them.
 
     Args:
         numbers: several numbers, or the only one.
         apart_from: as above.
+        returns: as above.
     """
 
     numbers: tuple[int, ...]
     apart_from: str | None = None
+    returns: bool = False
 
-    def __init__(self, numbers: int | tuple[int, ...], *, apart_from: str | None = None) -> None:
+    def __init__(
+        self, numbers: int | tuple[int, ...], *, apart_from: str | None = None, returns: bool = False
+    ) -> None:
         object.__setattr__(self, "numbers", (numbers,) if isinstance(numbers, int) else tuple(numbers))
         object.__setattr__(self, "apart_from", apart_from)
+        object.__setattr__(self, "returns", returns)
 
     @property
     def number(self) -> int:
@@ -52,10 +60,12 @@ class Windows:
     Attributes:
         number: windows per task.
         length: transitions per window.
+        returns: whether steps carry their returns to go and what belongs to them.
     """
 
     number: int
     length: int
+    returns: bool = False
 
 
 Kind: TypeAlias = Transitions | Trajectories | Windows
@@ -68,10 +78,13 @@ class BatchRequest:
     Attributes:
         tasks: tasks per batch, drawn without replacement; all selected tasks where there are fewer.
         kinds: what is drawn of every task, by a name of the method's choice. A kind of number 0 is left out.
+            A kind's draws depend on its name; other kinds never change them.
+        gamma: discount factor of the returns to go.
 
     Raises:
         RequestError: a number that is negative or missing, a length below 1, or an `apart_from` that names
-            no other kind of trajectories, one that is itself apart from another, or one that is taken.
+            no other kind of trajectories, one that is itself apart from another, or one that is taken; a
+            gamma outside [0, 1].
 
     Example:
         >>> request = BatchRequest(
@@ -89,10 +102,13 @@ class BatchRequest:
 
     tasks: int
     kinds: Mapping[str, Kind]
+    gamma: float = 1.0
 
     def __post_init__(self) -> None:
         if self.tasks < 1:
             raise RequestError(f"a batch holds at least 1 task, the request says {self.tasks}")
+        if not 0 <= self.gamma <= 1:
+            raise RequestError(f"gamma must lie in [0, 1], the request says {self.gamma}")
         for name, kind in self.kinds.items():
             _check_numbers(name, kind)
         _check_partners(self.kinds)

@@ -14,6 +14,7 @@ from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_sequence
 from tcmrl_data.sampling.batch import Batch, Moments
 from tcmrl_data.sampling.cache import load_rows
 from tcmrl_data.sampling.draws import Draws
+from tcmrl_data.sampling.endings import Endings
 from tcmrl_data.sampling.gather import Gatherer, place_table
 from tcmrl_data.sampling.moments import moments_of
 from tcmrl_data.sampling.prefetch import Prefetch
@@ -74,8 +75,10 @@ class Sampler:
     """Serves batch n as a pure function of (seed, stream, n); made by `open_sampler`.
 
     Within a batch, tasks are drawn without replacement; within a task, transitions and windows uniformly
-    over all valid ones (with replacement), trajectories uniformly without replacement. Episodes without
-    a step are never drawn, episodes shorter than a window hold none. Task parameters are never loaded.
+    over all valid ones (with replacement), trajectories uniformly without replacement. Tasks and every kind
+    have random streams of their own, a kind's keyed by its name: no kind changes the draws of another.
+    Episodes without a step are never drawn, episodes shorter than a window hold none. Task parameters are
+    never loaded.
 
     On a CUDA device the rows live there if they take at most half of its free memory; otherwise batches
     are gathered in page-locked memory and copied without blocking.
@@ -112,15 +115,26 @@ class Sampler:
         self._rows, self._place = rows, place
         self._table = place_table(rows.table, self.device)
         sequence = keyed_sequence(seed, environment, NO_TASK, Purpose.SAMPLER, stream)
-        self._key = sequence.generate_state(2, np.uint64)
+        self._sequence, self._endings = sequence, dict[float, Endings]()
         self._serve(request)
 
     def _serve(self, request: BatchRequest) -> None:
         self.request = request
-        self._draws = Draws(self._rows.episodes, request, key=self._key)
+        self._draws = Draws(self._rows.episodes, request, sequence=self._sequence)
         self._check()
-        num_tasks = self._draws.num_tasks
-        self._gather = Gatherer(self._rows, self._table, request, num_tasks=num_tasks, device=self.device)
+        endings = None
+        if any(kind.returns for kind in request.kinds.values()):
+            if request.gamma not in self._endings:
+                self._endings[request.gamma] = Endings.of(self._rows, request.gamma)
+            endings = self._endings[request.gamma]
+        self._gather = Gatherer(
+            self._rows,
+            self._table,
+            request,
+            num_tasks=self._draws.num_tasks,
+            device=self.device,
+            endings=endings,
+        )
 
     def with_request(self, request: BatchRequest) -> Self:
         """A sampler of the same steps, seed and stream for another request; nothing is loaded again.
