@@ -1,1 +1,1 @@
-"""Recipes, one TOML file per environment family; installed as the data package `tcmrl_manifests`."""
+"""Recipes, one TOML file per environment family, installed as the package `tcmrl_manifests`."""
