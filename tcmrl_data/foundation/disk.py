@@ -1,4 +1,4 @@
-"""Every file operation that matters: staging, fsync, rename, lock, gc."""
+"""File operations that survive a crash: staging, fsync, rename and locks."""
 
 import contextlib
 import errno
@@ -6,10 +6,11 @@ import fcntl
 import os
 import shutil
 import tempfile
+import time
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TextIO
+from typing import IO, Any, TextIO
 
 from tcmrl_data.foundation.errors import LockedError, ReadOnlyError, StorageError
 
@@ -17,18 +18,22 @@ STAGING = ".staging"
 LOCK = ".lock"
 CHECKPOINTS = ".checkpoints"
 
-GO_ON = "make room on the disk or mend it, then run the same command again to go on"
+PROBE_ATTEMPTS = 100
+PROBE_SECONDS = 0.02
+"""A writer retries this often, at this interval, while `lock_holder` looks at the lock."""
+
+GO_ON = "make room on the disk or repair it, then run the same command again to continue"
 
 
 class Disk:
-    """The operations that change what a disk holds; tests put one in its place that fails or forgets."""
+    """Operations that change a disk; tests replace it by one that fails or loses data."""
 
     def make_folder(self, path: Path) -> None:
-        """Makes one folder."""
+        """Creates one folder."""
         path.mkdir()
 
     def write(self, path: Path, data: bytes) -> None:
-        """Writes a new file; not forced to disk."""
+        """Writes a new file without forcing it to disk."""
         with path.open("xb") as file:
             file.write(data)
 
@@ -41,7 +46,7 @@ class Disk:
             os.close(descriptor)
 
     def rename(self, source: Path, target: Path) -> None:
-        """Moves a file over another one, or a folder into an empty place, in one step."""
+        """Replaces a file, or moves a folder to a path that is free or an empty folder, atomically."""
         os.replace(source, target)
 
 
@@ -52,7 +57,7 @@ def write_file(path: Path, data: bytes) -> None:
     """Writes a new file and forces its content, not its name, to disk.
 
     Raises:
-        StorageError: the disk refuses.
+        StorageError: the operating system refuses the operation.
     """
     with named_errors(path):
         disk.write(path, data)
@@ -60,54 +65,54 @@ def write_file(path: Path, data: bytes) -> None:
 
 
 def make_folders(path: Path) -> None:
-    """Makes a folder and its parents, each name forced to disk."""
-    missing = [each for each in (path, *path.parents) if not each.exists()]
+    """Creates a folder and its parents, and forces their names to disk."""
+    missing = [folder for folder in (path, *path.parents) if not folder.exists()]
     with named_errors(path):
-        for each in reversed(missing):
-            with contextlib.suppress(FileExistsError):  # another worker may have made it meanwhile
-                disk.make_folder(each)
-            disk.sync(each.parent)
+        for folder in reversed(missing):
+            with contextlib.suppress(FileExistsError):  # another worker may have created it meanwhile
+                disk.make_folder(folder)
+            disk.sync(folder.parent)
 
 
 def _make_staging(path: Path) -> None:
-    """Makes the staging folder; its name may be lost, since nothing in it is meant to last."""
+    """Creates the staging folder; not forced to disk, since a crash may lose its content."""
     if not path.is_dir():
         with named_errors(path), contextlib.suppress(FileExistsError):
             disk.make_folder(path)
 
 
 def write_tree(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes files (relative path to content) into a new folder and forces all of it to disk.
+    """Writes files (relative path to content) into a new folder and forces them to disk.
 
     Raises:
-        StorageError: the disk refuses.
+        StorageError: the operating system refuses the operation.
     """
-    folders = {folder, *(folder / each for name in files for each in Path(name).parents)}
+    folders = {folder, *(folder / parent for name in files for parent in Path(name).parents)}
     with named_errors(folder):
-        for each in sorted(folders):
-            disk.make_folder(each)
+        for path in sorted(folders):
+            disk.make_folder(path)
         for name, data in files.items():
             write_file(folder / name, data)
-        for each in sorted(folders, reverse=True):
-            disk.sync(each)
+        for path in sorted(folders, reverse=True):
+            disk.sync(path)
 
 
 def sync_tree(folder: Path) -> None:
-    """Forces everything below and including a folder to disk, for files that a library wrote."""
-    for each in sorted([folder, *folder.rglob("*")], reverse=True):
-        disk.sync(each)
+    """Forces a folder and everything below it to disk, for files written by a library."""
+    for path in sorted([folder, *folder.rglob("*")], reverse=True):
+        disk.sync(path)
 
 
 def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> None:
-    """Puts `data` at a path in one step: readers see the old file or the new one.
+    """Replaces a file atomically: readers see the old content or the new content.
 
     Args:
-        path: the file; folders above it are made.
-        data: its content.
-        staging: folder for the unfinished file; it lies beside the file, hidden, where None.
+        path: the file; missing parent folders are created.
+        data: the new content.
+        staging: folder for the unfinished file; None writes a hidden file next to `path`.
 
     Raises:
-        StorageError: the disk refuses; the old file stands.
+        StorageError: the operating system refuses the operation; the old file is unchanged.
     """
     if staging is not None:
         _make_staging(staging)
@@ -123,24 +128,24 @@ def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> Non
 
 
 def remove_tree(folder: Path) -> None:
-    """Removes a folder and all it holds, if it is there."""
+    """Removes a folder and its content, if it exists."""
     shutil.rmtree(folder, ignore_errors=True)
 
 
 def publish_folder(root: Path, target: Path, files: Mapping[str, bytes], *, attempt: str) -> bool:
-    """Makes a folder with the given files appear at `target` in one step.
+    """Publishes a folder with the given files at `target` atomically.
 
     Args:
         root: folder whose staging area is used, such as a dataset's.
-        target: final place inside it; its parent exists.
+        target: path inside `root`; its parent exists.
         files: relative path to content.
-        attempt: names the staging folder, for people who look.
+        attempt: prefix of the staging folder's name.
 
     Returns:
-        False where a folder stands at `target` already; nothing is changed then.
+        False if `target` already exists; nothing is changed then.
 
     Raises:
-        StorageError: the disk refuses; nothing is published.
+        StorageError: the operating system refuses the operation; nothing is published.
     """
     staging = root / STAGING
     _make_staging(staging)
@@ -155,10 +160,10 @@ def publish_folder(root: Path, target: Path, files: Mapping[str, bytes], *, atte
 
 
 def move_into_place(staged: Path, target: Path) -> bool:
-    """Renames a synced folder to its final place; False where a folder that is not empty stands there.
+    """Renames a synced folder to its final path; returns False if a non-empty folder is already there.
 
     Raises:
-        StorageError: the disk refuses.
+        StorageError: the operating system refuses the operation.
     """
     with named_errors(target):
         try:
@@ -173,10 +178,10 @@ def move_into_place(staged: Path, target: Path) -> bool:
 
 @contextlib.contextmanager
 def named_errors(path: Path, *, remedy: str = GO_ON) -> Iterator[None]:
-    """Turns what the operating system reports into an error that names the path and a remedy.
+    """Turns an `OSError` into an error that names the path and a remedy.
 
     Raises:
-        StorageError: the disk refuses.
+        StorageError: the operating system refuses an operation within the block.
     """
     try:
         yield
@@ -186,17 +191,17 @@ def named_errors(path: Path, *, remedy: str = GO_ON) -> Iterator[None]:
 
 
 def require_room(file: Path, num_bytes: int, *, remedy: str = GO_ON) -> None:
-    """Checks that a file can grow, or be made, before a library writes it that fails badly if it cannot.
+    """Checks that a file can grow, or be created, for libraries that fail badly on a full disk.
 
-    The bytes are reserved for a moment in an unnamed file, so that quotas and limits of a file's size count.
+    The bytes are reserved briefly in an unnamed file, so that quotas and file size limits are checked too.
 
     Args:
-        file: its folder exists.
-        num_bytes: by how much it grows.
-        remedy: ends the error's text.
+        file: the file; its folder exists.
+        num_bytes: growth of the file.
+        remedy: end of the error message.
 
     Raises:
-        StorageError: the disk refuses.
+        StorageError: the file cannot grow by `num_bytes`.
     """
     with named_errors(file, remedy=remedy), tempfile.TemporaryFile(dir=file.parent) as scratch:
         size = file.stat().st_size if file.exists() else 0
@@ -208,18 +213,45 @@ def lock_file(path: Path, what: str) -> Iterator[Path]:
     """Holds an exclusive lock on a file that names its holder.
 
     Raises:
-        LockedError: another process holds it; the message names that process.
+        LockedError: another process holds the lock; the message names that process.
         ReadOnlyError: the folder cannot be written.
     """
     with _open_lock(path) as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise LockedError(f"{what} is being written by {_holder(path)}; wait for it or stop it") from None
+        if not _lock_for_writing(file):
+            raise LockedError(f"{what} is being written by {_holder(path)}; wait for it or stop it")
         file.truncate(0)
         file.write(f"process {os.getpid()} on {os.uname().nodename}")
         file.flush()
         yield path
+
+
+def _lock_for_writing(file: TextIO) -> bool:
+    """Takes the exclusive lock; returns False at once if another writer holds it.
+
+    `lock_holder` takes a shared lock briefly. A shared lock is no reason to refuse, so it is waited for.
+    """
+    for _ in range(PROBE_ATTEMPTS):
+        if try_lock(file, fcntl.LOCK_EX):
+            return True
+        if not try_lock(file, fcntl.LOCK_SH):
+            return False
+        fcntl.flock(file, fcntl.LOCK_UN)
+        time.sleep(PROBE_SECONDS)
+    return False
+
+
+def try_lock(file: IO[Any], kind: int) -> bool:
+    """Takes a lock on an open file; returns False if another holder prevents it.
+
+    Args:
+        file: the open file.
+        kind: `fcntl.LOCK_SH` or `fcntl.LOCK_EX`.
+    """
+    try:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def _open_lock(path: Path) -> TextIO:
@@ -234,15 +266,11 @@ def _open_lock(path: Path) -> TextIO:
 
 
 def lock_holder(path: Path) -> str | None:
-    """The process that holds a lock, or None where nobody does."""
+    """The process that holds an exclusive lock, or None if no process does; the file may be read-only."""
     if not path.is_file():
         return None
     with path.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return _holder(path)
-    return None
+        return None if try_lock(file, fcntl.LOCK_SH) else _holder(path)
 
 
 def _holder(path: Path) -> str:
@@ -250,10 +278,11 @@ def _holder(path: Path) -> str:
 
 
 def remove_abandoned(root: Path) -> list[str]:
-    """Removes staging whose owner is gone; returns what was removed. The caller is the only writer.
+    """Removes staged attempts whose process has ended, and returns their names.
 
-    An attempt is made after its lock and removed before it, so what has no lock has no owner; and files on
-    their way to their place belong to the lock's holder, or to a worker whose driver is gone.
+    The caller must be the only writer. A process creates an attempt after the attempt's lock and removes it
+    before the lock, so an attempt without a lock is abandoned. A single staged file belongs to the caller,
+    or to a worker whose driver has ended.
     """
     staging = root / STAGING
     removed = []

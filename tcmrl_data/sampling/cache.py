@@ -15,7 +15,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from tcmrl_data.foundation.canonical import digest
-from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, make_folders, remove_abandoned, remove_tree
+from tcmrl_data.foundation.disk import (
+    LOCK,
+    STAGING,
+    lock_file,
+    make_folders,
+    remove_abandoned,
+    remove_tree,
+    try_lock,
+)
 from tcmrl_data.foundation.errors import CacheError, LockedError, StorageError
 from tcmrl_data.foundation.machine import available_memory
 from tcmrl_data.foundation.sizes import parse_bytes, size
@@ -26,7 +34,6 @@ from tcmrl_data.sampling.cache_entry import (
     open_entry,
     read_record,
     selected,
-    try_lock,
     write_entry,
 )
 from tcmrl_data.sampling.rows import PackedRows, plan_rows, read_rows, table_shape

@@ -112,15 +112,6 @@ def is_current(file: IO[bytes], path: Path) -> bool:
     return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())
 
 
-def try_lock(file: IO[bytes], kind: int) -> bool:
-    """Locks an open file as fcntl names it, unless another holder is in the way."""
-    try:
-        fcntl.flock(file, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
 def selected(selection: "Selection") -> tuple[tuple[int, tuple[int, ...]], ...]:
     """A selection in plain terms: per task, its index and its snapshot steps."""
     return tuple((task.index, selection.steps[task.index]) for task in selection.tasks)
