@@ -1,1 +1,1 @@
-"""What everything stands on: errors, seeds, canonical JSON, safe file operations, plug-ins."""
+"""Shared foundations: errors, seeds, canonical JSON, safe file operations and plug-ins."""

@@ -1,4 +1,4 @@
-"""Canonical JSON: one byte string per value, so that digests mean something, and a strict reader."""
+"""Canonical JSON, which gives equal values equal digests, and a strict JSON parser."""
 
 import hashlib
 import json
@@ -14,26 +14,27 @@ MAX_JSON_DEPTH = 32
 
 
 def canonical_json(value: Any) -> bytes:
-    """Sorted keys, no spaces, ASCII, no NaN; floats in Python's shortest round-trip form."""
+    """JSON with sorted keys, no spaces, ASCII only, no NaN, and floats in the shortest round-trip form."""
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
     return text.encode("ascii") + b"\n"
 
 
 def sha256(data: bytes | memoryview) -> str:
-    """Hexadecimal sha256."""
+    """The sha256 of data, in hexadecimal."""
     return hashlib.sha256(data).hexdigest()
 
 
 def digest(value: Any) -> str:
-    """sha256 of a value's canonical JSON."""
+    """The sha256 of a value's canonical JSON, in hexadecimal."""
     return sha256(canonical_json(value))
 
 
 def parse_json(data: bytes) -> Any:
-    """Parses JSON of a stranger: bounded in size, values and depth; no duplicate keys, NaN or infinity.
+    """Parses untrusted JSON; limits size, number of values and depth.
 
     Raises:
-        ValueError: what is wrong, without the file's name; callers add it.
+        ValueError: the data exceeds a limit, is invalid JSON, or holds duplicate keys, NaN or infinity. The
+            message does not name the file; callers add the name.
     """
     if len(data) > MAX_JSON_BYTES:
         raise ValueError(f"{len(data)} bytes of JSON exceed the limit of {MAX_JSON_BYTES}")
@@ -50,7 +51,7 @@ def parse_json(data: bytes) -> Any:
 
 
 def _depth(data: bytes) -> int:
-    """An upper bound on nesting, without recursion: brackets inside strings only make it stricter."""
+    """An upper bound of the nesting depth, computed without recursion; it counts brackets in strings too."""
     depth = deepest = 0
     for byte in data.translate(None, delete=_NO_BRACKETS):
         if byte in b"[{":
@@ -68,8 +69,8 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     result = dict(pairs)
     if len(result) < len(pairs):
         seen: set[str] = set()
-        twice = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
-        raise ValueError(f"duplicate key {twice[:80]!r}")
+        duplicate = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"duplicate key {duplicate[:80]!r}")
     return result
 
 

@@ -1,4 +1,4 @@
-"""The errors a user can mend. Each message is one line: the rule, the value, the place, the remedy."""
+"""Errors that a user can fix. A message is one line: the rule, the value, the place, the remedy."""
 
 
 class TcmrlError(Exception):
@@ -14,7 +14,7 @@ class PluginError(TcmrlError):
 
 
 class RecipeError(TcmrlError):
-    """A recipe, profile or `--set` override that does not validate."""
+    """A recipe, profile or `--set` override that is not valid."""
 
 
 class TaskError(TcmrlError):
@@ -26,15 +26,15 @@ class TrajectoryError(TcmrlError):
 
 
 class StoreError(TcmrlError):
-    """A part on disk whose files, layout or values are not what they must be."""
+    """A part on disk whose files, layout or values are not valid."""
 
 
 class ManifestError(TcmrlError):
-    """A manifest that is missing, truncated, edited, or of another schema version."""
+    """A manifest that is missing, truncated, edited, or has another schema version."""
 
 
 class SnapshotError(TcmrlError):
-    """A policy snapshot that cannot be rebuilt."""
+    """A policy snapshot that cannot be read or rebuilt."""
 
 
 class SelectionError(TcmrlError):
@@ -42,35 +42,35 @@ class SelectionError(TcmrlError):
 
 
 class RequestError(TcmrlError):
-    """A batch request whose numbers or names do not hold together."""
+    """A batch request with invalid numbers, or with names that contradict each other."""
 
 
 class BuildError(TcmrlError):
-    """A build that cannot start, or units that failed."""
+    """A build that cannot start, or whose units failed."""
 
 
 class StorageError(BuildError):
-    """The disk refused an operation; what was published before stands."""
+    """The operating system refused a file operation; data published earlier are unchanged."""
 
 
 class ReadOnlyError(StorageError):
-    """The dataset's folder cannot be written by this user, or lies on a disk that is mounted to be read."""
+    """The user may not write to the dataset's folder, or its disk is mounted read-only."""
 
 
 class CacheError(TcmrlError):
-    """The cache of decoded steps cannot be used, or a size of it that cannot be read."""
+    """The cache of decoded steps cannot be used, or the text of its size limit is not valid."""
 
 
 class LockedError(BuildError):
-    """Another process works on the dataset."""
+    """Another process is writing to the dataset."""
 
 
 class NondeterminismError(BuildError):
-    """The same unit settings and seeds gave different data."""
+    """Equal unit settings and seeds produced different data."""
 
 
 class MissingPackageError(TcmrlError):
-    """An optional package that is not installed; the message names the extra that brings it."""
+    """An optional package is not installed; the message names the extra that installs it."""
 
 
 class CheckpointError(TcmrlError):

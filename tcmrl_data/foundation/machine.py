@@ -1,4 +1,4 @@
-"""What this process may use of the machine: its CPU affinity and the limits of its control group count."""
+"""Cores and memory available to this process, limited by its CPU affinity and its control groups."""
 
 import os
 from collections.abc import Iterator
@@ -9,13 +9,13 @@ OWN_CGROUPS = Path("/proc/self/cgroup")
 
 
 def available_cores() -> int:
-    """Cores that this process may use, at least 1: the CPU affinity, capped by quotas of control groups."""
+    """Cores available to this process, at least 1: the CPU affinity, limited by control group quotas."""
     cores = len(os.sched_getaffinity(0))
     return max(1, int(min([cores, *_cpu_quotas()])))
 
 
 def available_memory() -> int:
-    """Bytes that can be had without swapping, as the kernel estimates them, capped by control groups."""
+    """Bytes available without swapping, as estimated by the kernel and limited by control groups."""
     return max(0, min([_machine_memory(), *_memory_quotas()]))
 
 
@@ -27,7 +27,7 @@ def _machine_memory() -> int:
 
 
 def _cpu_quotas() -> Iterator[float]:
-    """Cores' worth of time per period, of every group that limits it."""
+    """The CPU quota, in cores, of every control group that has one."""
     for folder in _groups("cpu"):
         words = _words(folder / "cpu.max") or [
             *_words(folder / "cpu.cfs_quota_us"),
@@ -38,7 +38,7 @@ def _cpu_quotas() -> Iterator[float]:
 
 
 def _memory_quotas() -> Iterator[int]:
-    """Bytes left of the limit of every group that has one; cached file contents can be given up."""
+    """Free bytes below the limit of every control group that has one; inactive page cache counts as free."""
     names = (("memory.max", "memory.current"), ("memory.limit_in_bytes", "memory.usage_in_bytes"))
     for folder in _groups("memory"):
         for limit, usage in names:
@@ -50,10 +50,10 @@ def _memory_quotas() -> Iterator[int]:
 
 
 def _groups(controller: str) -> Iterator[Path]:
-    """Folders of this process's control groups that hold a controller, and of the groups above them.
+    """Folders of this process's control groups with a controller, and of their parent groups.
 
-    A line of /proc/self/cgroup is `number:controllers:path`; version 2 names no controllers. A container
-    often sees its own group as the root, whatever the path says.
+    A line of /proc/self/cgroup is `number:controllers:path`; version 2 names no controllers. In a container
+    the group may be mounted as the root, so that the folder of the path does not exist.
     """
     lines = OWN_CGROUPS.read_text().splitlines() if OWN_CGROUPS.is_file() else []
     for line in lines:
@@ -62,7 +62,7 @@ def _groups(controller: str) -> Iterator[Path]:
             continue
         root = CGROUPS / controllers if controllers else CGROUPS
         group = Path(path.lstrip("/"))
-        yield from (root / place for place in (group, *group.parents))
+        yield from (root / folder for folder in (group, *group.parents))
 
 
 def _words(file: Path) -> list[str]:

@@ -1,4 +1,4 @@
-"""Reading a stranger's files: plain ones only, never through a link, never more than was agreed."""
+"""Reading untrusted files: regular files only, without following links, up to a size limit."""
 
 import os
 import stat
@@ -15,10 +15,10 @@ KINDS = {
 
 
 def file_problem(status: os.stat_result) -> str | None:
-    """Why a file of this `lstat` is not read, in words; None for a plain file.
+    """Why a file with this `lstat` result must not be read; None for a regular file with one name.
 
-    A file with several names (hard links) is refused too: a published file never changes, and another
-    name, outside the dataset, can change it. Copying the dataset gives every file one name.
+    A file with hard links is refused, because a program can change it through a name outside the dataset.
+    Copying the dataset gives every file one name.
     """
     if not stat.S_ISREG(status.st_mode):
         return f"is {KINDS.get(stat.S_IFMT(status.st_mode), 'something odd')}, not a plain file"
@@ -28,17 +28,17 @@ def file_problem(status: os.stat_result) -> str | None:
 
 
 def read_plain_file(file: Path, *, limit: int) -> bytes:
-    """The content of a plain file.
+    """Reads a regular file.
 
-    Never blocks on a FIFO, never follows a link in the last place of the path (`folder_problem` looks at
-    the places above), never allocates more than the file's size or the limit.
+    Does not block on a FIFO, does not follow a link in the path's last component (`folder_problem` checks the
+    components before it), and allocates at most `limit` bytes.
 
     Args:
-        file: what to read.
-        limit: most bytes allowed.
+        file: the file.
+        limit: maximum size in bytes.
 
     Raises:
-        ValueError: no plain file, or larger than the limit; says why, without the file's name.
+        ValueError: not a regular file, or larger than the limit; the message does not name the file.
         OSError: the file is missing or cannot be read.
     """
     _require_plain(os.lstat(file), limit)
@@ -50,15 +50,18 @@ def read_plain_file(file: Path, *, limit: int) -> bytes:
 
 
 def folder_problem(root: Path, folder: str) -> tuple[str, str] | None:
-    """The first place on the way from a root to a folder below it that is no true folder, and why.
+    """Finds the first component of a relative path that is not a real folder.
 
     Args:
-        root: trusted; may itself be reached through a link.
-        folder: relative path below it.
+        root: trusted folder; its own path may contain links.
+        folder: path relative to `root`.
+
+    Returns:
+        The component's path relative to `root` and the reason, or None if all components are folders.
     """
     path = ""
     for name in Path(folder).parts:
-        path = os.path.join(path, name)  # plain text: this runs for every file of a dataset
+        path = os.path.join(path, name)  # faster than Path; this runs for every file of a dataset
         try:
             mode = os.lstat(os.path.join(root, path)).st_mode
         except OSError as error:
@@ -70,9 +73,10 @@ def folder_problem(root: Path, folder: str) -> tuple[str, str] | None:
 
 
 def printable(text: str) -> str:
-    r"""Text as a terminal may see it: whatever is not printable as a backslash escape, such as `\x1b`."""
+    r"""Text with every character that is not printable replaced by an escape such as `\x1b`."""
     return "".join(
-        each if each.isprintable() else each.encode("unicode_escape").decode("ascii") for each in text
+        character if character.isprintable() else character.encode("unicode_escape").decode("ascii")
+        for character in text
     )
 
 
@@ -83,7 +87,7 @@ def one_line(error: Exception) -> str:
 
 
 def words_after(error: Exception, file: Path) -> str:
-    """What an error says of a file, without the file's name that it starts with."""
+    """An error's message without the file name at its start."""
     return str(error).removeprefix(str(file)).lstrip(": ")
 
 

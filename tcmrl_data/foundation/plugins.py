@@ -1,4 +1,4 @@
-"""Plug-ins: classes that installed packages declare as entry points, found without importing them."""
+"""Plug-ins: classes that installed packages declare as entry points."""
 
 import difflib
 import functools
@@ -14,12 +14,12 @@ Kind = TypeVar("Kind")
 
 
 class Registry(Generic[Kind]):
-    """The plug-ins of one kind, by name; listing names imports none of them.
+    """The plug-ins of one kind, by name; listing the names imports no plug-in.
 
     Args:
-        group: the entry points' group, such as `tcmrl.engines`.
-        noun: what error messages call a plug-in of this kind.
-        base: the class that every plug-in of this kind derives from.
+        group: the entry point group, such as `tcmrl.engines`.
+        noun: the word for a plug-in of this kind in error messages.
+        base: base class of all plug-ins of this kind.
 
     Example:
         >>> from tcmrl_data.engine.base import ENGINES
@@ -31,15 +31,15 @@ class Registry(Generic[Kind]):
         self.group, self.noun, self.base = group, noun, base
 
     def names(self) -> list[str]:
-        """The declared names, sorted; broken plug-ins included."""
+        """The declared names, sorted, including those of broken plug-ins."""
         return declared_names(self.group)
 
     def get(self, name: str) -> type[Kind]:
-        """The class behind a name; no other plug-in of the group is imported.
+        """The class with the given name; imports no other plug-in of the group.
 
         Raises:
-            UnknownNameError: no package declares the name; the message lists the nearest names.
-            PluginError: the plug-in cannot be imported, is no usable subclass of the base class, or two
+            UnknownNameError: no package declares the name; the message lists similar names.
+            PluginError: the plug-in cannot be imported, is not a usable subclass of the base class, or two
                 packages declare its name.
         """
         entries = self._entries()
@@ -55,20 +55,18 @@ class Registry(Generic[Kind]):
             found = entry.load()
             defect = self.defect(found, name)
         except (Exception, SystemExit) as error:  # importing a module may raise anything
-            raise PluginError(
-                f"{problem}: {one_line_error(error)}; repair or uninstall the package"
-            ) from error
+            raise PluginError(f"{problem}: {one_line_error(error)}; {remedy}") from error
         if defect:
             raise PluginError(f"{problem}: {entry.value} {defect}; {remedy}")
         plugin: type[Kind] = found
         return plugin
 
     def working(self) -> dict[str, type[Kind]]:
-        """The class of every plug-in that is not broken, by name; imports all plug-ins of this kind."""
+        """The class of every working plug-in, by name; imports all plug-ins of this kind."""
         return self._load_all()[0]
 
     def broken(self) -> dict[str, str]:
-        """The error of every plug-in that is broken, by name; imports all plug-ins of this kind."""
+        """The error message of every broken plug-in, by name; imports all plug-ins of this kind."""
         return self._load_all()[1]
 
     def _load_all(self) -> tuple[dict[str, type[Kind]], dict[str, str]]:
@@ -87,7 +85,7 @@ class Registry(Generic[Kind]):
         return found
 
     def defect(self, found: object, name: str) -> str | None:
-        """Why an imported object cannot be a plug-in of a name, or None where it can."""
+        """Why an imported object cannot be the plug-in with the given name; None if it can."""
         if not (isinstance(found, type) and issubclass(found, self.base)):
             return f"is no subclass of {self.base.__module__}.{self.base.__qualname__}"
         if inspect.isabstract(found):
@@ -99,7 +97,7 @@ class Registry(Generic[Kind]):
 
 @functools.lru_cache
 def _declared(group: str, path: tuple[str, ...]) -> EntryPoints:
-    """A group's entry points below `sys.path`; reading them takes about 20 ms."""
+    """A group's entry points on `sys.path`; cached, because reading them takes about 20 ms."""
     return entry_points(group=group)
 
 
@@ -109,12 +107,12 @@ def declared_names(group: str) -> list[str]:
 
 
 def check_declared(group: str, noun: str, name: str) -> None:
-    """Refuses a name that no installed package declares in an entry point group; imports no plug-in.
+    """Checks that an installed package declares a name in an entry point group; imports no plug-in.
 
-    For settings, which stand in a room below the base class of the plug-ins that they name.
+    For settings classes, which may not import the base class of the plug-ins that they name.
 
     Raises:
-        UnknownNameError: lists the nearest names.
+        UnknownNameError: no package declares the name; the message lists similar names.
     """
     names = declared_names(group)
     if name not in names:
@@ -126,12 +124,12 @@ def _package(entry: EntryPoint) -> str:
 
 
 def one_line_error(error: BaseException) -> str:
-    """Kind and message of what a plug-in raised."""
+    """An exception's type and message in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
-    """An error that contains the unknown name and the nearest known names."""
+    """An error that contains the unknown name and similar known names."""
     names = sorted(known)
     if not names:
         return UnknownNameError(f"unknown {kind} {name!r}; none is installed, install tcmrl again")

@@ -1,4 +1,4 @@
-"""Records as JSON files, and the strict reading of a stranger's: no text that a terminal would obey."""
+"""Records as JSON files, and strict parsing of untrusted ones."""
 
 import unicodedata
 from pathlib import Path
@@ -13,11 +13,11 @@ from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.validation import first_problem
 
 HIDDEN_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
-"""Unicode categories of control, direction and surrogate characters and of line separators."""
+"""Unicode categories of control, format and surrogate characters and of line separators."""
 
 
 class Record(BaseModel):
-    """A record of a dataset: frozen, no unknown keys, no conversion of types, no NaN."""
+    """A record of a dataset: frozen; unknown keys, type conversions and NaN are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
@@ -26,32 +26,32 @@ Kind = TypeVar("Kind", bound=BaseModel)
 
 
 def write_record(file: Path, record: BaseModel) -> None:
-    """Writes a record as JSON, in one step.
+    """Writes a record as JSON, atomically.
 
     Raises:
-        StorageError: the disk refuses; the old file stands.
+        StorageError: the operating system refuses the operation; the old file is unchanged.
     """
     replace_file(file, record_bytes(record))
 
 
 def record_bytes(record: BaseModel) -> bytes:
-    """A record as the text of a JSON file."""
+    """A record as the content of a JSON file."""
     return (record.model_dump_json(indent=1, by_alias=True) + "\n").encode()
 
 
 def read_record(
     kind: type[Kind], file: Path, *, remedy: str = "", error: type[TcmrlError] = CheckpointError
 ) -> Kind:
-    """Takes back what `write_record` wrote.
+    """Reads a record written by `write_record`.
 
     Args:
-        kind: what it is a record of.
-        file: where.
-        remedy: ends the message where the content is no such record.
-        error: the kind of error to raise; a training run's by default.
+        kind: class of the record.
+        file: the JSON file.
+        remedy: end of the message if the content is not valid.
+        error: class of the error to raise.
 
     Raises:
-        TcmrlError: of the given kind: the file is missing, or is not such a record.
+        TcmrlError: of class `error`: the file is missing, or its content is not a valid `kind`.
     """
     try:
         return kind.model_validate_json(file.read_bytes())
@@ -62,11 +62,11 @@ def read_record(
 
 
 def parse_record(kind: type[Kind], values: Any, file: Path, *, version: int) -> Kind:
-    """A dataset's record of parsed JSON, validated strictly.
+    """Validates parsed JSON strictly as a record of a dataset.
 
     Raises:
-        ManifestError: another schema version, hidden text, or values that do not validate; names file
-            and field.
+        ManifestError: another schema version, control characters, or invalid values; the message names the
+            file and the field.
     """
     found = values.get("schema_version") if isinstance(values, dict) else None
     if found != version or isinstance(found, bool):
@@ -74,13 +74,14 @@ def parse_record(kind: type[Kind], values: Any, file: Path, *, version: int) -> 
             f"{file}: schema_version {repr(found)[:40]} is not {version}, which this version reads"
         )
     text = canonical_json(values)
-    # canonical JSON escapes whatever is not printable ASCII, but for DEL
+    # canonical JSON escapes every character outside printable ASCII, except DEL
     hidden = _hidden_text(values) if b"\\" in text or b"\x7f" in text else None
     if hidden:
         place = printable(hidden)[:200]
         raise ManifestError(f"{file}: {place} holds control characters, which a terminal would obey")
     try:
-        # errors over JSON text copy what they complain of, over and over; these refer to it
+        # Errors of model_validate_json copy the input many times. Errors of model_validate refer to it,
+        # so a large invalid record fails here, in little memory.
         kind.model_validate(_with_tuples(values))
         return kind.model_validate_json(text)
     except ValidationError as error:
@@ -88,24 +89,24 @@ def parse_record(kind: type[Kind], values: Any, file: Path, *, version: int) -> 
 
 
 def _with_tuples(value: Any) -> Any:
-    """Parsed JSON as strict validation of Python values wants it."""
+    """Parsed JSON with tuples instead of lists, as strict validation of Python values requires."""
     if isinstance(value, dict):
-        return {key: _with_tuples(each) for key, each in value.items()}
+        return {key: _with_tuples(member) for key, member in value.items()}
     return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
 
 
 def _hidden_text(value: Any, place: str = "") -> str | None:
-    """The field whose name or text holds hidden characters."""
+    """The path of the first field whose name or text holds hidden characters."""
     if isinstance(value, str):
         return place if _is_hidden(value, allowed="\n\t") else None
     members = (
         value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     )
-    for key, each in members:
+    for key, member in members:
         inner = f"{place}.{key}" if place else str(key)
         if isinstance(key, str) and _is_hidden(key, allowed=""):
             return inner
-        found = _hidden_text(each, inner)
+        found = _hidden_text(member, inner)
         if found:
             return found
     return None
@@ -113,5 +114,6 @@ def _hidden_text(value: Any, place: str = "") -> str | None:
 
 def _is_hidden(text: str, *, allowed: str) -> bool:
     return not text.isprintable() and any(
-        unicodedata.category(each) in HIDDEN_CATEGORIES and each not in allowed for each in text
+        unicodedata.category(character) in HIDDEN_CATEGORIES and character not in allowed
+        for character in text
     )

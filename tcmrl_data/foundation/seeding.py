@@ -1,4 +1,4 @@
-"""Keyed seeds: every random stream is addressed by what it is for, never by the order of drawing."""
+"""Keyed seeds: the seed of a random stream depends on its purpose and not on the order of drawing."""
 
 import enum
 import hashlib
@@ -6,11 +6,11 @@ import hashlib
 import numpy as np
 
 NO_TASK = 2**32 - 1
-"""The task entry of a stream that belongs to a whole environment."""
+"""The task entry for a stream that belongs to the whole environment."""
 
 
 class Purpose(enum.IntEnum):
-    """What a stream is for. Entries are part of the data's identity: add, never renumber."""
+    """Purpose of a random stream. The numbers are part of the data's identity: never change one."""
 
     SPLIT = 0
     BEHAVIOR = 1
@@ -29,24 +29,24 @@ class Purpose(enum.IntEnum):
 
 
 def environment_key(environment: str) -> int:
-    """First four bytes of sha256(name), big-endian: stable over versions, below 2**32."""
+    """The first four bytes of sha256(name) as a big-endian integer; the same in every version."""
     return int.from_bytes(hashlib.sha256(environment.encode()).digest()[:4], "big")
 
 
 def keyed_sequence(
     root: int, environment: str, task: int, purpose: Purpose, *index: int
 ) -> np.random.SeedSequence:
-    """Seed sequence addressed by (environment, task, purpose, *index) under the seed `root`.
+    """The seed sequence with the key (environment, task, purpose, *index) under the seed `root`.
 
     Args:
         root: the seed of the build, the task set or the run; any non-negative integer.
         environment: the environment's name.
         task: the task's index, or NO_TASK.
-        purpose: what the stream is for.
+        purpose: the stream's purpose.
         index: further coordinates, such as (snapshot step, episode).
 
     Raises:
-        ValueError: an entry is negative or not below 2**32, where entries would collide.
+        ValueError: an entry lies outside [0, 2**32), so that two keys could give the same seed.
     """
     key = (environment_key(environment), task, int(purpose), *index)
     if any(not 0 <= entry < 2**32 for entry in key):
@@ -55,12 +55,12 @@ def keyed_sequence(
 
 
 def keyed_seed(root: int, environment: str, task: int, purpose: Purpose, *index: int) -> int:
-    """One uint32 for libraries that take an integer seed; arguments as for `keyed_sequence`."""
+    """One uint32, for libraries that take an integer seed; arguments as for `keyed_sequence`."""
     return int(keyed_sequence(root, environment, task, purpose, *index).generate_state(1)[0])
 
 
 def keyed_generator(
     root: int, environment: str, task: int, purpose: Purpose, *index: int
 ) -> np.random.Generator:
-    """NumPy generator of the addressed stream; arguments as for `keyed_sequence`."""
+    """A NumPy generator; arguments as for `keyed_sequence`."""
     return np.random.default_rng(keyed_sequence(root, environment, task, purpose, *index))

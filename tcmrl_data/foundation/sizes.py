@@ -1,4 +1,4 @@
-"""Sizes in bytes: written for people, and read from what people write."""
+"""Formatting and parsing of sizes in bytes."""
 
 import re
 
@@ -8,7 +8,7 @@ UNITS = {"": 1, "k": 10**3, "M": 10**6, "G": 10**9, "T": 10**12}
 
 
 def size(num_bytes: float) -> str:
-    """Bytes in decimal units, such as `12.3 MB`."""
+    """A number of bytes as text in decimal units, such as `12.3 MB`."""
     for unit in ("B", "kB", "MB", "GB"):
         if num_bytes < 1_000:
             return f"{num_bytes:.0f} B" if unit == "B" else f"{num_bytes:.1f} {unit}"
@@ -17,10 +17,10 @@ def size(num_bytes: float) -> str:
 
 
 def parse_bytes(text: str) -> int:
-    """Bytes named by text such as `2G`, `500M` or `1.5 GB`; decimal units.
+    """Parses a size such as `2G`, `500M` or `1.5 GB` (decimal units) into bytes.
 
     Raises:
-        CacheError: the text names no size above 0; the message says what is allowed.
+        CacheError: the text is not a size above 0.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([kKMGT]?)B?", text.strip())
     num_bytes = int(float(match[1]) * UNITS[match[2].replace("K", "k")]) if match else 0

@@ -1,4 +1,4 @@
-"""Tables that people write, validated: the first complaint in one line, near names for an unknown key."""
+"""Validation of configuration tables, with one-line errors that suggest names for unknown keys."""
 
 import difflib
 import json
@@ -17,17 +17,17 @@ Table = TypeVar("Table", bound=BaseModel)
 def validate_table(
     kind: type[Table], values: Mapping[str, Any], *, place: str, error: type[TcmrlError], table: str = ""
 ) -> Table:
-    """The values as a settings object; strict, but a list may stand for a tuple.
+    """Validates a table strictly, except that a list is accepted for a tuple.
 
     Args:
         kind: the settings class.
-        values: the table, as a TOML file holds it.
-        place: names the table's origin in the message.
-        error: the kind of error to raise.
+        values: the table, as parsed from TOML.
+        place: origin of the table, for the error message.
+        error: class of the error to raise.
         table: dotted path of the table within its origin.
 
     Raises:
-        TcmrlError: of the given kind, with the first complaint in one line.
+        TcmrlError: of class `error`, with the first problem in one line.
     """
     try:
         return kind.model_validate_json(json.dumps(values, default=str), strict=True)
@@ -36,12 +36,12 @@ def validate_table(
 
 
 def first_problem(error: ValidationError, *, kind: type[BaseModel] | None = None, table: str = "") -> str:
-    """The first complaint of a validation in one line: field, rule, value.
+    """The first problem of a validation error in one line: field, rule, value.
 
     Args:
-        error: pydantic's.
-        kind: the class that refused the values; an unknown key is then told with the nearest known ones.
-        table: dotted path in front of every field.
+        error: the error raised by pydantic.
+        kind: the settings class; if given, the message for an unknown key suggests similar keys.
+        table: dotted path to put in front of the field.
     """
     detail = error.errors()[0]
     place = detail["loc"]
@@ -54,18 +54,18 @@ def first_problem(error: ValidationError, *, kind: type[BaseModel] | None = None
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
-    """What to write instead of an unknown name, as the end of an error message."""
+    """A suggestion of known names, for the end of an error message about an unknown name."""
     names = sorted(known)
     found = difflib.get_close_matches(name, names, n=3)
     return f"did you mean {', '.join(found)}?" if found else f"known are {', '.join(names)}"
 
 
 def known_keys(kind: Any, place: Sequence[str | int]) -> list[str]:
-    """Keys that the table at a place within a settings class may have; none where it is no table.
+    """The keys that a nested table of a settings class may have; empty if the value is not a table.
 
     Args:
         kind: a settings class, or the type of one of its fields.
-        place: keys and indices that lead from it to the table.
+        place: keys and indices that lead from `kind` to the nested table.
     """
     if isinstance(kind, type) and issubclass(kind, BaseModel):
         fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
