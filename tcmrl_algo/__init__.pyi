@@ -8,7 +8,6 @@ from .adaptation.protocols.base import Protocol as Protocol
 from .context_methods.learner import ContextAlgorithm as ContextAlgorithm
 from .context_methods.learner import ContextLearner as ContextLearner
 from .context_methods.learner import ContextLosses as ContextLosses
-from .context_methods.packing import pack as pack
 from .experiment.aggregate import Summary as Summary
 from .experiment.aggregate import summarize as summarize
 from .experiment.config import Experiment as Experiment
@@ -23,7 +22,11 @@ from .methods.base import METHODS as METHODS
 from .methods.base import Algorithm as Algorithm
 from .methods.base import Capabilities as Capabilities
 from .methods.base import Method as Method
+from .methods.base import MethodConfig as MethodConfig
 from .methods.base import Metrics as Metrics
+from .methods.network_algorithm import FunctionController as FunctionController
+from .methods.network_algorithm import NetworkAlgorithm as NetworkAlgorithm
+from .methods.packing import pack as pack
 from .methods.problem import Problem as Problem
 from .methods.stages import Stage as Stage
 from .methods.stages import StagedOptimizer as StagedOptimizer

@@ -54,13 +54,22 @@ def settings(*, steps: int = 100, **actor_critic: Any) -> TrainingSettings:
     )
 
 
-def steps(*shape: int, seed: int, lengths: tuple[int, ...] | None = None) -> Steps:
+def steps(*shape: int, seed: int, lengths: tuple[int, ...] | None = None, returns: bool = False) -> Steps:
     generator = torch.Generator().manual_seed(seed)
     draw = lambda *more: torch.randn(*shape, *more, generator=generator)  # noqa: E731
     mask = torch.ones(shape, dtype=torch.bool)
     for task, length in enumerate(lengths or ()):
         mask[task, :, length:] = False
-    return Steps(draw(3), draw(2).tanh(), draw(), draw(3), torch.zeros(shape), mask)
+    drawn = Steps(draw(3), draw(2).tanh(), draw(), draw(3), torch.zeros(shape), mask)
+    if not returns:
+        return drawn
+    return replace(
+        drawn,
+        returns_to_go=draw() * mask,
+        discounts_to_end=draw().sigmoid() * mask,
+        final_observations=draw(3) * mask.unsqueeze(-1),
+        times=torch.zeros(shape, dtype=torch.int64),
+    )
 
 
 def batch(*, lengths: tuple[int, ...] | None = (6, 4, 5), trajectories: int = 2) -> Batch:
@@ -82,7 +91,7 @@ def batch_for(request: BatchRequest, *, seed: int) -> Batch:
         elif isinstance(kind, Windows):
             shape += (kind.length,)
         lengths = (6, 4, 5) if isinstance(kind, Trajectories) else None
-        kinds[name] = steps(*shape, seed=100 * seed + place, lengths=lengths)
+        kinds[name] = steps(*shape, seed=100 * seed + place, lengths=lengths, returns=kind.returns)
     return Batch(torch.tensor(TRAINING_TASKS), kinds)
 
 

@@ -217,7 +217,8 @@ def test_rewards_that_are_all_zero_train_and_adapt(name: str) -> None:
 
 
 def without_rewards(values: Steps) -> Steps:
-    return replace(values, rewards=torch.zeros_like(values.rewards))
+    returns = None if values.returns_to_go is None else torch.zeros_like(values.returns_to_go)
+    return replace(values, rewards=torch.zeros_like(values.rewards), returns_to_go=returns)
 
 
 def test_tasks_of_a_batch_are_found_among_the_training_tasks() -> None:

@@ -3,6 +3,7 @@
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -11,15 +12,15 @@ from tcmrl_algo.algorithms import focal, no_context, tcmrl
 from tcmrl_algo.context_methods.attention import attention_of
 from tcmrl_algo.context_methods.learner import (
     ContextAlgorithm,
-    ContextController,
     ContextLearner,
     ContextLosses,
 )
-from tcmrl_algo.context_methods.packing import pack
 from tcmrl_algo.losses import context as losses
+from tcmrl_algo.methods.base import MethodConfig
+from tcmrl_algo.methods.packing import pack
 from tcmrl_algo.networks.momentum import follow, momentum_copy
 from tcmrl_algo.networks.optimizer import Adam, ParameterGroup
-from tcmrl_data import Batch, BatchRequest, Controller, Steps, Transitions
+from tcmrl_data import Batch, BatchRequest, Controller, Steps, Transitions, UniformController
 from tests.made_up import TASKS, batch, problem, settings, trajectory, with_steps
 
 
@@ -38,10 +39,22 @@ def test_packed_trajectories_keep_their_steps_and_mask_the_rest() -> None:
     assert packed.mask.sum(dim=-1).tolist() == [[6, 0], [4, 2]]
     expected = torch.from_numpy(lanes[1][1].observations[1:])
     torch.testing.assert_close(packed.next_observations[1, 1, :2], expected)
+    assert packed.returns_to_go is None
+
+
+def test_packed_trajectories_carry_what_lies_between_a_step_and_their_end() -> None:
+    short = replace(trajectory(2, 0), rewards=np.array([1.0, 4.0], dtype=np.float32))
+    packed = pack([[trajectory(3, 1), short]], problem(), gamma=0.5)
+    found = (packed.returns_to_go, packed.discounts_to_end, packed.times, packed.final_observations)
+    returns, discounts, times, final = (value[0, 1] for value in found if value is not None)
+    assert returns.tolist() == [3.0, 4.0, 0.0]
+    assert discounts.tolist() == [0.25, 0.5, 0.0]
+    assert times.tolist() == [0, 1, 0]
+    np.testing.assert_array_equal(final, [short.observations[2], short.observations[2], np.zeros(3)])
 
 
 def test_no_context_needs_no_trajectories() -> None:
-    request = no_context.NoContext().batch_request(settings(), no_context.NoContextConfig())
+    request = no_context.NoContext().batch_request(settings(), MethodConfig())
     assert request == BatchRequest(TASKS, {"policy": Transitions(5)})
 
 
@@ -120,14 +133,14 @@ def test_a_learner_may_collect_and_optimise_in_its_own_way() -> None:
             return {"inner": self.adam}
 
         def explore(self, actor_critic: ActorCritic, trajectories: Any) -> Controller:
-            return ContextController(actor_critic, torch.zeros(len(trajectories), 0))
+            return actor_critic.controller(torch.zeros(len(trajectories), 0))
 
     method = ContextAlgorithm(problem(), settings(), learner=Own())
     before = method.learner.inner.weight.item()
     method.update(batch(), 1)
     assert method.learner.inner.weight.item() == pytest.approx(before - 0.1)  # one step of its own alone
     assert "optimizer/inner/weight/step" in method.tensors()
-    assert isinstance(method.explore([[], []]), ContextController)
+    assert not isinstance(method.explore([[], []]), UniformController)
 
 
 class Momentum(ContextLearner):

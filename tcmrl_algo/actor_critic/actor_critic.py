@@ -10,13 +10,14 @@ from tcmrl_algo.actor_critic.brac import DualCritic
 from tcmrl_algo.actor_critic.rows import ConditionedRows
 from tcmrl_algo.losses.actor_critic import policy_loss, q_loss, value_loss
 from tcmrl_algo.methods.base import Metrics
+from tcmrl_algo.methods.network_algorithm import FunctionController
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.networks.momentum import follow, momentum_copy
 from tcmrl_algo.networks.optimizer import Adam
 from tcmrl_algo.networks.perceptron import Perceptron, PerceptronEnsemble, Standardizer, call_frozen
 from tcmrl_algo.networks.policy import PolicyActions, PolicyNetwork
 from tcmrl_algo.settings.actor_critic import ActorCriticSettings
-from tcmrl_data import Steps
+from tcmrl_data import Controller, Steps
 
 LARGEST_Q = "actor_critic/largest_q"
 
@@ -184,6 +185,10 @@ class ActorCritic(nn.Module):
         with torch.no_grad():
             mean, _ = self.policy(torch.cat([self.scaling(observations), context], dim=-1))
             return torch.tanh(mean)
+
+    def controller(self, context: Float[Tensor, "lanes latent"]) -> Controller:
+        """Acts by the policy's most likely actions under one fixed context per lane."""
+        return FunctionController(lambda states: self.act(states, context), context.device)
 
 
 def _by_row(context: Float[Tensor, "tasks *steps latent"], steps: Steps) -> Float[Tensor, "rows latent"]:

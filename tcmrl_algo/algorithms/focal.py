@@ -4,20 +4,20 @@ from typing import final
 
 import torch
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor
 
 from tcmrl_algo.context_methods.encoding import ContextEncoder
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.losses import context as losses
-from tcmrl_algo.methods.base import Algorithm, Method
+from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions
 
 
-class FocalConfig(BaseModel):
+class FocalConfig(MethodConfig):
     """The `[training.focal]` table. No weight: one loss alone trains the encoder, and Adam has no scale.
 
     Attributes:
@@ -25,8 +25,6 @@ class FocalConfig(BaseModel):
         encoder_hidden: widths of the context encoder (published code: 200 x 3).
         epsilon: bounds the repulsion of two tasks' contexts (published code: 0.1).
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     latent: int = Field(default=20, ge=1)
     encoder_hidden: tuple[int, ...] = (200, 200, 200)

@@ -10,20 +10,13 @@ from typing import final
 
 import torch
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.methods.base import Algorithm, Capabilities, Method
+from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Transitions
-
-
-class NoContextConfig(BaseModel):
-    """The `[training.no_context]` table: nothing but the shared settings matters."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 @final
@@ -41,16 +34,15 @@ class Blind(ContextLearner):
 
 
 @final
-class NoContext(Method[NoContextConfig]):
+class NoContext(Method[MethodConfig]):
     """The plug-in."""
 
     name = "no_context"
-    Config = NoContextConfig
     capabilities = Capabilities(blind=True, needs_trajectories=False)
 
-    def batch_request(self, settings: TrainingSettings, config: NoContextConfig) -> BatchRequest:
+    def batch_request(self, settings: TrainingSettings, config: MethodConfig) -> BatchRequest:
         """The actor-critic's transitions: nothing here reads a trajectory."""
         return BatchRequest(settings.batch.tasks, {"policy": Transitions(settings.batch.transitions)})
 
-    def create(self, problem: Problem, settings: TrainingSettings, config: NoContextConfig) -> Algorithm:
+    def create(self, problem: Problem, settings: TrainingSettings, config: MethodConfig) -> Algorithm:
         return ContextAlgorithm(problem, settings, learner=Blind())

@@ -10,7 +10,7 @@ from torch import Tensor, nn
 from tcmrl_algo.context_methods.encoding import ContextEncoder, EncoderInputs
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.losses import context as losses
-from tcmrl_algo.methods.base import Algorithm, Method, Metrics
+from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig, Metrics
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.networks.attention import Attention, TaskExtractor, uniform_attention
 from tcmrl_algo.networks.perceptron import call_frozen
@@ -42,7 +42,7 @@ class Weights(BaseModel):
     orthogonality: float = Field(default=0.0, ge=0)
 
 
-class TcmrlConfig(BaseModel):
+class TcmrlConfig(MethodConfig):
     """The `[training.tcmrl]` table. K is `training.batch.window_length`.
 
     Attributes:
@@ -63,8 +63,6 @@ class TcmrlConfig(BaseModel):
         temperature: of the contrastive loss (paper: none, 1).
         weights: of the loss terms.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     latent: int = Field(default=20, ge=1)
     encoder_hidden: tuple[int, ...] = (200, 200, 200)

@@ -5,14 +5,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
-import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
 from tcmrl_algo.actor_critic.actor_critic import ActorCritic
-from tcmrl_algo.context_methods.packing import pack
 from tcmrl_algo.methods.base import Algorithm, Metrics
+from tcmrl_algo.methods.packing import pack
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.methods.stages import StagedOptimizer
 from tcmrl_algo.methods.state import TrainedModules
@@ -149,7 +148,7 @@ class ContextAlgorithm(Algorithm):
     def adapt(
         self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
     ) -> Controller:
-        return ContextController(self.actor_critic, self.context(trajectories))
+        return self.actor_critic.controller(self.context(trajectories))
 
     def context(self, trajectories: Sequence[Sequence[Trajectory]]) -> Float[Tensor, "lanes latent"]:
         """One context per lane, of all its trajectories together."""
@@ -170,18 +169,3 @@ class ContextAlgorithm(Algorithm):
 def _in_everything(name: str) -> str:
     """The name of a learner's part in the module that holds the actor-critic too."""
     return f"context.{name}" if name else "context"
-
-
-@final
-class ContextController(Controller):
-    """Acts under one fixed context per lane."""
-
-    def __init__(self, actor_critic: ActorCritic, context: Float[Tensor, "lanes latent"]) -> None:
-        self._actor_critic, self._context = actor_critic, context
-
-    def act(
-        self, observations: np.typing.NDArray[np.floating], noise: np.typing.NDArray[np.floating]
-    ) -> np.typing.NDArray[np.floating]:
-        states = torch.as_tensor(observations, dtype=torch.float32, device=self._context.device)
-        actions: np.typing.NDArray[np.floating] = self._actor_critic.act(states, self._context).cpu().numpy()
-        return actions

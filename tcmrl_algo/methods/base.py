@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, TypeVar
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from tcmrl_algo.methods.problem import Problem
@@ -14,9 +14,15 @@ from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Controller, Trajectory, UniformController
 from tcmrl_data.foundation.plugins import Registry
 
-ConfigT = TypeVar("ConfigT", bound=BaseModel)
+ConfigT = TypeVar("ConfigT", bound="MethodConfig")
 Metrics = dict[str, Tensor]
 """Scalars of one training step, by flat names such as `loss/reward`."""
+
+
+class MethodConfig(BaseModel):
+    """A method's own settings, `[training.<name>]`: none, or the fields of a subclass."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 @dataclass(frozen=True)
@@ -93,7 +99,7 @@ class Method(abc.ABC, Generic[ConfigT]):
 
     Attributes:
         name: as `--algo` and a recipe's `[training.<name>]` table spell it.
-        Config: the method's own settings, a frozen pydantic model whose docstring documents every field.
+        Config: the method's own settings; its docstring documents every field.
         capabilities: what evaluation may expect.
 
     Example:
@@ -102,7 +108,7 @@ class Method(abc.ABC, Generic[ConfigT]):
     """
 
     name: ClassVar[str]
-    Config: ClassVar[type[BaseModel]]
+    Config: ClassVar[type[MethodConfig]] = MethodConfig
     capabilities: ClassVar[Capabilities] = Capabilities()
 
     @abc.abstractmethod

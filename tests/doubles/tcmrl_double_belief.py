@@ -1,46 +1,36 @@
 """A belief that every step changes, and a policy that reads it; no trajectory is the prior."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
-import numpy as np
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
 
 from tcmrl_algo import (
     Algorithm,
     Capabilities,
+    FunctionController,
     Method,
+    MethodConfig,
     Metrics,
+    NetworkAlgorithm,
     Problem,
-    StagedOptimizer,
-    TrainedModules,
     TrainingSettings,
+    pack,
 )
-from tcmrl_algo.context_methods.packing import pack
 from tcmrl_algo.networks.perceptron import linear
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectories, Trajectory, Transition
 
 BELIEF = 4
 
 
-class BeliefConfig(BaseModel):
-    """No settings."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class BeliefLearner(Algorithm):
+class BeliefLearner(NetworkAlgorithm):
     """A recurrent belief trained by copying the actions of trajectories."""
 
     def __init__(self, problem: Problem, settings: TrainingSettings) -> None:
-        self.problem, generator = problem, problem.generator(0)
-        states, actions = problem.observation_dim, problem.action_dim
+        states, actions, generator = problem.observation_dim, problem.action_dim, problem.generator(0)
         self.change = linear(BELIEF + states + actions + 1, BELIEF, generator)
         self.policy = linear(states + BELIEF, actions, generator)
-        networks = nn.ModuleDict({"change": self.change, "policy": self.policy})
-        self.optimizer = StagedOptimizer(networks, problem.stages, settings.optimizer)
-        self.trained = TrainedModules({"networks": networks}, self.optimizer.adams)
+        super().__init__(problem, settings, nn.ModuleDict({"change": self.change, "policy": self.policy}))
 
     def follow(
         self, belief: Tensor, states: Tensor, actions: Tensor, rewards: Tensor, real: Tensor
@@ -59,14 +49,12 @@ class BeliefLearner(Algorithm):
             found.append(self.follow(found[-1], *now))
         return found
 
-    def update(self, batch: Batch, step: int) -> Metrics:
-        self.optimizer.begin(step)
+    def loss(self, batch: Batch, step: int) -> tuple[Tensor, Metrics]:
         steps = batch["episodes"]
         beliefs = torch.stack(self.beliefs(steps)[:-1], dim=1)
         errors = self.act(steps.observations.flatten(1, 2), beliefs) - steps.actions.flatten(1, 2)
         loss = errors[steps.mask.flatten(1, 2)].square().mean()
-        self.optimizer.step(loss, step)
-        return {"loss/copy": loss.detach()}
+        return loss, {"loss/copy": loss}
 
     def adapt(
         self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
@@ -74,22 +62,13 @@ class BeliefLearner(Algorithm):
         with torch.no_grad():
             return BeliefController(self, self.beliefs(pack(trajectories, self.problem))[-1])
 
-    def tensors(self) -> dict[str, Tensor]:
-        return self.trained.tensors()
 
-    def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
-        self.trained.load_tensors(tensors)
-
-
-class BeliefController(Controller):
+class BeliefController(FunctionController):
     """Acts by a belief that every step changes."""
 
     def __init__(self, learner: BeliefLearner, belief: Tensor) -> None:
+        super().__init__(lambda states: learner.act(states, self._belief), learner.problem.device)
         self._learner, self._belief = learner, belief
-
-    def act(self, observations: np.ndarray, noise: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return self._learner.act(torch.as_tensor(observations).float(), self._belief).numpy()
 
     def observe(self, transition: Transition) -> None:
         names = ("observations", "actions", "rewards")
@@ -98,15 +77,14 @@ class BeliefController(Controller):
             self._belief = self._learner.follow(self._belief, *values, torch.as_tensor(transition.active))
 
 
-class BeliefMethod(Method[BeliefConfig]):
+class BeliefMethod(Method[MethodConfig]):
     """The plug-in."""
 
     name = "double_belief"
-    Config = BeliefConfig
     capabilities = Capabilities(stateful=True, needs_trajectories=False)
 
-    def batch_request(self, settings: TrainingSettings, config: BeliefConfig) -> BatchRequest:
+    def batch_request(self, settings: TrainingSettings, config: MethodConfig) -> BatchRequest:
         return BatchRequest(settings.batch.tasks, {"episodes": Trajectories(2)})
 
-    def create(self, problem: Problem, settings: TrainingSettings, config: BeliefConfig) -> Algorithm:
+    def create(self, problem: Problem, settings: TrainingSettings, config: MethodConfig) -> Algorithm:
         return BeliefLearner(problem, settings)

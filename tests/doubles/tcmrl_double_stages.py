@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 
 import torch
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from tcmrl_algo import (
@@ -12,6 +11,7 @@ from tcmrl_algo import (
     ContextLearner,
     ContextLosses,
     Method,
+    MethodConfig,
     Problem,
     Stage,
     TrainingSettings,
@@ -20,15 +20,13 @@ from tcmrl_algo.networks.perceptron import linear
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions
 
 
-class StagesConfig(BaseModel):
+class StagesConfig(MethodConfig):
     """Settings.
 
     Attributes:
         model_steps: of the first stage.
         encoder_steps: of the second stage.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     model_steps: int = 2
     encoder_steps: int = 2

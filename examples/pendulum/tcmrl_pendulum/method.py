@@ -9,12 +9,12 @@ from typing import final
 
 import torch
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor
 
 from tcmrl_algo.context_methods.encoding import ContextEncoder
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.methods.base import Algorithm, Method
+from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.networks.perceptron import Perceptron
@@ -22,15 +22,13 @@ from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions
 
 
-class RewardRegressionConfig(BaseModel):
+class RewardRegressionConfig(MethodConfig):
     """The `[training.reward_regression]` table.
 
     Attributes:
         latent: size of the context.
         hidden: widths of the encoder and of the predictor.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     latent: int = Field(default=8, ge=1)
     hidden: tuple[int, ...] = (64, 64)
