@@ -43,8 +43,8 @@ def curves(recipe: Recipe, tasks: list[Task], seed: int) -> Returns:
         environment=environment,
         tasks=tasks,
         seed=seed,
-        observation=recipe.behavior["observation"],
-        reward=recipe.behavior["reward"],
+        observation=recipe.behavior.observation,
+        reward=recipe.behavior.reward,
         report=lambda count: None,
         checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
     )
@@ -117,7 +117,7 @@ def main() -> None:
     result = {
         "benchmark": "behavior_parity",
         "environment": arguments.environment,
-        "behavior": recipes["sac"].behavior["settings"],
+        "behavior": recipes["sac"].behavior.settings,
         "tasks": [task.index for task in tasks],
         "sac_seeds": 2 * arguments.seeds,
         "curves": {source: values.mean(axis=(0, 1)).tolist() for source, values in found.items()},
@@ -136,7 +136,7 @@ def recipe_of(source: str, arguments: argparse.Namespace) -> Recipe:
             arguments.environment, profile=arguments.profile, behavior=source, overrides=chosen
         )
 
-    steps = arguments.steps or load([]).behavior["settings"]["steps"]
+    steps = arguments.steps or load([]).behavior.settings["steps"]
     snapshots = [steps * k // CHECKPOINTS for k in range(CHECKPOINTS + 1)]
     training = [f"behavior.sac.steps={steps}", f"behavior.sac.snapshots={snapshots}"]
     return load([*training, "rollouts.episodes=20", "rollouts.lanes=20"])

@@ -60,8 +60,8 @@ def measure(recipe: Recipe, num_tasks: int, seconds: float) -> float:
         environment=recipe.make_environment(),
         tasks=choose_tasks(recipe, range(num_tasks)),
         seed=0,
-        observation=recipe.behavior["observation"],
-        reward=recipe.behavior["reward"],
+        observation=recipe.behavior.observation,
+        reward=recipe.behavior.reward,
         report=report,
         checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
     )

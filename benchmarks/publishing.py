@@ -67,7 +67,7 @@ def main() -> None:
         }
         for name, watch in (("fsync", syncs), ("sha256", hashes))
     }
-    document = {"environment": recipe.environment["name"], "unit_seconds": round(seconds, 2), "bytes": size}
+    document = {"environment": recipe.environment.name, "unit_seconds": round(seconds, 2), "bytes": size}
     print(json.dumps(document | shares))
 
 

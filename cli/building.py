@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from tcmrl_data.foundation.sizes import size
+from tcmrl_data.recipe.profile import PROFILES, Profile
 
 from .frame import (
     duration,
@@ -29,17 +30,28 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
+recipe_argument = click.argument("name_or_file", metavar="ENV|FILE")
+profile_option = click.option(
+    "--profile",
+    type=click.Choice(PROFILES),
+    default="paper",
+    show_default=True,
+    help="The recipe as written, or its smaller form.",
+)
+set_option = click.option(
+    "--set",
+    "overrides",
+    metavar="SECTION.KEY=VALUE",
+    multiple=True,
+    help="Change a value of the recipe; may be repeated.",
+)
+
+
 def recipe_options(command: Command) -> Command:
-    """Adds the argument ENV and the options that say what is built and how."""
+    """Adds the argument ENV|FILE and the options that say what is built and how."""
     decorators = (
-        click.argument("environment", metavar="ENV"),
-        click.option(
-            "--profile",
-            type=click.Choice(["paper", "quick", "reduced"]),
-            default="paper",
-            show_default=True,
-            help="The recipe as written, or its smaller form.",
-        ),
+        recipe_argument,
+        profile_option,
         click.option(
             "--behavior",
             type=BEHAVIOR,
@@ -50,13 +62,7 @@ def recipe_options(command: Command) -> Command:
             metavar="LIST",
             help="Indices of the full task set, such as 0-9,12, instead of the profile's choice.",
         ),
-        click.option(
-            "--set",
-            "overrides",
-            metavar="SECTION.KEY=VALUE",
-            multiple=True,
-            help="Change a value of the recipe; may be repeated.",
-        ),
+        set_option,
         click.option(
             "--workers", type=click.IntRange(min=1), help="Processes at a time; all cores if left out."
         ),
@@ -77,8 +83,8 @@ def recipe_options(command: Command) -> Command:
 @click.command()
 @recipe_options
 def plan(
-    environment: str,
-    profile: str,
+    name_or_file: str,
+    profile: Profile,
     behavior: str | None,
     tasks: str | None,
     overrides: tuple[str, ...],
@@ -87,18 +93,19 @@ def plan(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Say what a build of ENV would take.
+    """Say what a build would take, by the recipe of an environment ENV or by a recipe FILE of your own.
 
-    The time is estimated from a probe of a few seconds on this machine.
+    FILE ends in .toml. The time is estimated from a probe of a few seconds on this machine.
 
     \b
     Examples:
       tcmrl-data plan half-cheetah-vel
       tcmrl-data plan ml1/reach --behavior scripted --tasks 0-9 --workers 8
+      tcmrl-data plan my-recipe.toml
     """
     import tcmrl_data
 
-    recipe = _load(environment, profile, behavior, overrides)
+    recipe = tcmrl_data.load_recipe(name_or_file, profile=profile, overrides=overrides, behavior=behavior)
     chosen = _parse_tasks(recipe, tasks)
     remark("measuring this machine for a few seconds …", quiet=quiet or as_json)
     planned = tcmrl_data.forecast_build(tcmrl_data.plan_build(recipe, tasks=chosen), workers=workers)
@@ -127,7 +134,10 @@ def plan(
 @click.command()
 @recipe_options
 @click.option(
-    "--out", type=click.Path(path_type=Path), metavar="FOLDER", help="The dataset; data/ENV if left out."
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="The dataset; data/<environment> if left out.",
 )
 @click.option(
     "--seed",
@@ -142,8 +152,8 @@ def plan(
     help="A running Ray cluster that shares the dataset's folder; one is started here if left out.",
 )
 def build(
-    environment: str,
-    profile: str,
+    name_or_file: str,
+    profile: Profile,
     behavior: str | None,
     tasks: str | None,
     overrides: tuple[str, ...],
@@ -155,7 +165,9 @@ def build(
     seed: int,
     ray_address: str | None,
 ) -> None:
-    """Build a dataset of ENV, or what is missing of one.
+    """Build a dataset, or what is missing of one, by the recipe of an environment ENV or by a recipe FILE.
+
+    FILE, a recipe of your own, ends in .toml and names its environment in the table [environment].
 
     A finished dataset is verified and left alone. A build that was stopped goes on when the same command
     runs again. `--tasks` with other indices extends a dataset.
@@ -165,12 +177,13 @@ def build(
       tcmrl-data build point-robot --profile quick
       tcmrl-data build half-cheetah-vel --tasks 0-9 --workers 4 --out data/cheetah
       tcmrl-data build ml1/reach --behavior scripted --set rollouts.episodes=20
+      tcmrl-data build my-recipe.toml --profile quick
     """
     import tcmrl_data
 
-    recipe = _load(environment, profile, behavior, overrides)
+    recipe = tcmrl_data.load_recipe(name_or_file, profile=profile, overrides=overrides, behavior=behavior)
     chosen = _parse_tasks(recipe, tasks)
-    out = out or Path("data") / environment
+    out = out or Path("data") / recipe.environment.name
     with stopped_by_signals(lambda: same_command(out)), StageProgress(quiet=quiet) as progress:
         report = tcmrl_data.build_dataset(
             recipe,
@@ -195,17 +208,10 @@ def build(
         fail_incomplete(f"{report.failed[0]}{more}; the same command tries again what is missing")
 
 
-def _load(environment: str, profile: str, behavior: str | None, overrides: tuple[str, ...]) -> "Recipe":
-    import tcmrl_data
-
-    chosen = next(each for each in tcmrl_data.PROFILES if each == profile)
-    return tcmrl_data.load_recipe(environment, profile=chosen, overrides=overrides, behavior=behavior)
-
-
 def _parse_tasks(recipe: "Recipe", text: str | None) -> list[int] | None:
     import tcmrl_data
 
-    return None if text is None else tcmrl_data.parse_indices(text, recipe.environment["tasks"])
+    return None if text is None else tcmrl_data.parse_indices(text, recipe.environment.tasks)
 
 
 def _show(event: "BuildEvent", progress: StageProgress) -> None:

@@ -2,9 +2,11 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING
 
 import click
+
+from tcmrl_data.recipe.profile import PROFILES, Profile
 
 from .evaluation import evaluate
 from .experiments import experiment
@@ -25,8 +27,6 @@ from .runs import runs
 if TYPE_CHECKING:
     from tcmrl_algo import Progress, TrainingConfig, TrainingReport
     from tcmrl_data import Dataset
-
-Profile = Literal["paper", "quick", "reduced"]
 
 
 def main() -> None:
@@ -62,7 +62,7 @@ tcmrl.add_command(runs)
 @click.option("--algo", type=ALGORITHM, help="The method; the recipe's if left out.")
 @click.option(
     "--profile",
-    type=click.Choice(get_args(Profile)),
+    type=click.Choice(PROFILES),
     help="Whose training table to use; the one the dataset was built with if left out.",
 )
 @click.option(

@@ -39,11 +39,11 @@ from .foundation.seeding import keyed_generator as keyed_generator
 from .foundation.seeding import keyed_seed as keyed_seed
 from .foundation.sizes import parse_bytes as parse_bytes
 from .interchange.formats.base import FORMATS as FORMATS
+from .recipe.document import apply_overrides as apply_overrides
 from .recipe.listing import list_environments as list_environments
-from .recipe.recipe import PROFILES as PROFILES
-from .recipe.recipe import Profile as Profile
+from .recipe.profile import PROFILES as PROFILES
+from .recipe.profile import Profile as Profile
 from .recipe.recipe import Recipe as Recipe
-from .recipe.recipe import apply_overrides as apply_overrides
 from .recipe.recipe import load_recipe as load_recipe
 from .recipe.tasks import parse_indices as parse_indices
 from .sampling.batch import Batch as Batch

@@ -39,8 +39,8 @@ def first_snapshot(recipe: Recipe, folder: Path, reported: list[int]) -> tuple[i
         environment=environment,
         tasks=draw_tasks(environment)[: min(2, source.group_size)],
         seed=0,
-        observation=recipe.behavior["observation"],
-        reward=recipe.behavior["reward"],
+        observation=recipe.behavior.observation,
+        reward=recipe.behavior.reward,
         report=reported.append,
         checkpoints=lambda tasks: CheckpointFolder(folder, "unit", key="key", before=float("inf")),
     )

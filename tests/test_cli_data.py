@@ -7,7 +7,8 @@ import pytest
 from tcmrl_cli.data import data
 
 import tcmrl_data
-from tcmrl_data import BuildReport, Dataset, Recipe
+from tcmrl_data import ENVIRONMENTS, BuildReport, Dataset, Recipe
+from tcmrl_data.store.manifest import MANIFEST, seal
 from tests.commands import Call, assert_refused, in_process
 from tests.conftest import TASKS, TINY
 
@@ -59,12 +60,36 @@ def test_build_reports_and_a_second_build_finds_everything(call: Call, tmp_path:
     assert report["root"][:12] in output
 
 
+def test_a_recipe_file_of_ones_own_builds_a_dataset_of_its_environment(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    text = ENVIRONMENTS.get("point-robot").recipe_file("point-robot").read_text(encoding="utf-8")
+    (tmp_path / "my-recipe.toml").write_text(text.replace("gamma = 0.9 ", "gamma = 0.8 "))
+    monkeypatch.chdir(tmp_path)
+    command = ["build", "my-recipe.toml", "--profile", "quick", *SETTINGS, "--tasks", "0", "--json"]
+    code, output, _ = call(*command, "--quiet")
+    assert (code, json.loads(output)["dataset"]) == (0, "data/point-robot")
+    recipe = tcmrl_data.open_dataset("data/point-robot").manifest.recipe
+    assert (recipe.environment.name, recipe.behavior.settings["gamma"]) == ("point-robot", 0.8)
+    assert json.loads(call(*command, "--quiet")[1])["present"] == 3
+    assert_refused(call("build", "point-robot", *command[2:]), "behavior.settings.gamma is 0.8 there")
+
+
+def test_a_recipe_file_that_is_none_is_refused_by_build_and_plan(call: Call, tmp_path: Path) -> None:
+    (tmp_path / "empty.toml").write_text("schema = 1\n")
+    for command in ("build", "plan"):
+        assert_refused(call(command, tmp_path / "nowhere.toml"), "nowhere.toml does not exist")
+        assert_refused(call(command, tmp_path / "empty.toml"), "[environment] has no name")
+
+
 def test_a_build_with_failing_units_ends_with_one_and_says_which(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fail(recipe: Recipe, out: Path, **options: object) -> BuildReport:
         failed = ("task 7 failed after 2 attempt(s) on here: killed", "task 9 failed")
-        return BuildReport(out, built=3, present=1, failed=failed, seconds=1.0, root="0" * 64)
+        return BuildReport(
+            out, built=3, present=1, failed=failed, seconds=1.0, root="0" * 64, read_only=False
+        )
 
     monkeypatch.setattr(tcmrl_data, "build_dataset", fail)
     code, output, errors = call("build", "point-robot", "--out", tmp_path / "d")
@@ -203,3 +228,20 @@ def test_no_arguments_prints_help_and_exits_with_two(call: Call) -> None:
     code, output, errors = call()
     assert (code, output) == (2, "")
     assert "Commands:" in errors
+
+
+def test_a_dataset_whose_environment_is_not_installed_is_still_listed_and_inspected(
+    call: Call, tiny_copy: Copy
+) -> None:
+    folder = tiny_copy()
+    values = json.loads((folder / MANIFEST).read_bytes())
+    del values["digest"]
+    values["name"] = "pole"
+    values["recipe"]["environment"].update(name="pole", lengths=[0.5, 1.0])
+    (folder / MANIFEST).write_bytes(seal(values))
+    code, output, _ = call("list", folder.parent, "--json")
+    assert (code, [row.get("name") for row in json.loads(output)["datasets"]]) == (0, ["pole"])
+    for subject in ("tasks", "snapshots", "returns"):
+        assert call("inspect", subject, folder)[0] == 0
+    settings = tcmrl_data.open_dataset(folder).manifest.recipe.unit_settings()
+    assert settings["environment"] == values["recipe"]["environment"]

@@ -42,4 +42,4 @@ def test_cheetah_reward_is_distance_in_velocity_and_effort() -> None:
 
 def test_cheetah_refuses_a_velocity_range_that_is_empty() -> None:
     with pytest.raises(ValueError, match=r"min_velocity \(3.0\) must be below max_velocity"):
-        make_environment(load_recipe("half-cheetah-vel").environment | {"min_velocity": 3.0})
+        make_environment(load_recipe("half-cheetah-vel").environment.model_dump() | {"min_velocity": 3.0})

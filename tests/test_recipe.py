@@ -1,11 +1,12 @@
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 
-from tcmrl_data import apply_overrides, list_environments, load_recipe
+from tcmrl_data import Recipe, apply_overrides, canonical_json, list_environments, load_recipe
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
-from tcmrl_data.recipe.recipe import PROFILES
+from tcmrl_data.recipe.profile import PROFILES
 from tcmrl_data.recipe.tasks import choose_tasks
 from tests.environments import some_members
 
@@ -30,12 +31,12 @@ def test_profiles_resolve(name: str) -> None:
     assert recipes["paper"].training == recipes["quick"].training
     for recipe in recipes.values():
         assert recipe.rollouts.episodes % recipe.rollouts.lanes == 0
-        assert recipe.environment["name"] == name
+        assert recipe.environment.name == name
 
 
 def test_sizes_are_the_papers() -> None:
     sizes = {
-        name: (environment["tasks"], environment["train"])
+        name: (environment.tasks, environment.train)
         for name in ENVIRONMENTS.members()
         for environment in [load_recipe(name).environment]
     }
@@ -110,3 +111,78 @@ def test_only_data_settings_are_unit_settings() -> None:
 def test_an_entropy_coefficient_that_is_not_above_0_is_refused(value: str) -> None:
     with pytest.raises(RecipeError, match="entropy"):
         load_recipe("point-robot", overrides=["behavior.source=sac", f"behavior.sac.entropy={value}"])
+
+
+@pytest.fixture
+def own_recipe(tmp_path: Path) -> Path:
+    """A recipe file of a user: the one of point-robot under another name."""
+    file = tmp_path / "my-recipe.toml"
+    file.write_text(ENVIRONMENTS.get("point-robot").recipe_file("point-robot").read_text(encoding="utf-8"))
+    return file
+
+
+def test_a_recipe_file_gives_the_recipe_of_the_environment_that_it_names(own_recipe: Path) -> None:
+    assert load_recipe(own_recipe, profile="quick") == load_recipe("point-robot", profile="quick")
+    own_recipe.write_text(own_recipe.read_text().replace('name = "point-robot"', 'name = "point-robot-wind"'))
+    assert load_recipe(own_recipe).make_environment().name == "point-robot-wind"
+
+
+def test_a_recipe_file_may_hold_variants_by_environment(own_recipe: Path) -> None:
+    text = own_recipe.read_text()
+    own_recipe.write_text(f'{text}\n[variants."point-robot".rollouts]\nepisodes = 100\n')
+    assert load_recipe(own_recipe).rollouts.episodes == 100
+    assert load_recipe(own_recipe, overrides=["rollouts.episodes=150"]).rollouts.episodes == 150
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "error"),
+    [
+        ('name = "point-robot"', "", r"\[environment\] has no name; write for example name = "),
+        ('name = "point-robot"', "name = 3", r"\[environment\] has no name"),
+        ('name = "point-robot"', 'name = "pointrobot"', "'pointrobot'; did you mean point-robot"),
+        ("schema = 1", "schema = 2", "schema 2 is not 1"),
+        ("schema = 1", "schema = ", "is no TOML: Invalid value"),
+        ("schema = 1", "schema = 1\nbuild = 5", r"build is a value; write it as a table \[build\]"),
+        ("[rollouts]", "[rolouts]", "unknown table 'rolouts'; did you mean rollouts"),
+        ("[rollouts]", "[build]", r"lacks the table \[rollouts\]"),
+        ("[profiles.quick.build]", "[profiles.quik.build]", "unknown profile 'quik'; did you mean quick"),
+        ("schema = 1", "schema = 1\nvariants = 5", "variants holds a value"),
+    ],
+)
+def test_a_recipe_file_that_is_none_is_refused_in_one_line(
+    own_recipe: Path, old: str, new: str, error: str
+) -> None:
+    text = own_recipe.read_text()
+    assert old in text
+    own_recipe.write_text(text.replace(old, new, 1))
+    with pytest.raises((RecipeError, UnknownNameError), match=error) as caught:
+        load_recipe(own_recipe)
+    assert str(caught.value).startswith(str(own_recipe))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_recipe_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RecipeError, match=r"nowhere.toml does not exist; name a recipe file or an environ"):
+        load_recipe(tmp_path / "nowhere.toml")
+    (tmp_path / "folder.toml").mkdir()
+    with pytest.raises(RecipeError, match=r"folder.toml cannot be read: Is a directory"):
+        load_recipe(tmp_path / "folder.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe")
+    with pytest.raises(RecipeError, match=r"binary.toml is no TOML: invalid start byte at byte 0"):
+        load_recipe(tmp_path / "binary.toml")
+
+
+def test_the_environment_of_a_recipe_cannot_be_set() -> None:
+    with pytest.raises(RecipeError, match="name another one as ENV"):
+        load_recipe("point-robot", overrides=["environment.name=point-robot-wind"])
+
+
+def test_a_recipe_is_the_same_after_json() -> None:
+    for name in ("point-robot", "ml1/reach", "half-cheetah-vel"):
+        recipe = load_recipe(name)
+        again = Recipe.model_validate_json(canonical_json(recipe.model_dump(mode="json")))
+        assert again == recipe
+        assert again.unit_settings() == recipe.unit_settings()
+        assert recipe.unit_settings()["environment"] == recipe.make_environment().settings.model_dump(
+            mode="json"
+        )

@@ -263,7 +263,7 @@ def test_recipes_agree_on_both_sources() -> None:
     for name in ("point-robot", "point-robot-wind", "half-cheetah-vel", "ml1/reach", "hopper-rand-params"):
         for profile in ("paper", "quick"):
             sac, stacked = (
-                load_recipe(name, profile=profile, behavior=source).behavior["settings"]  # type: ignore[arg-type]
+                load_recipe(name, profile=profile, behavior=source).behavior.settings  # type: ignore[arg-type]
                 for source in ("sac", "stacked")
             )
             assert {key: stacked[key] for key in sac} == sac

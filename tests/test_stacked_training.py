@@ -62,8 +62,8 @@ def context_of(
         environment=recipe.make_environment(),
         tasks=choose_tasks(recipe, tasks),
         seed=0,
-        observation=recipe.behavior["observation"],
-        reward=recipe.behavior["reward"],
+        observation=recipe.behavior.observation,
+        reward=recipe.behavior.reward,
         report=report,
         checkpoints=lambda _: CheckpointFolder(folder, "group", key="k", before=np.inf, seconds=seconds),
     )
@@ -74,7 +74,7 @@ def source_of(recipe: Recipe) -> StackedSource:
 
 
 def settings_of(recipe: Recipe) -> StackedSettings:
-    return StackedSettings.model_validate_json(canonical_json(recipe.behavior["settings"]))
+    return StackedSettings.model_validate_json(canonical_json(recipe.behavior.settings))
 
 
 def snapshots_of(recipe: Recipe, context: BehaviorContext) -> dict[tuple[int, int], Snapshot]:

@@ -56,7 +56,7 @@ def forecast_build(plan: BuildPlan, *, workers: int | None = None) -> Forecast:
     return Forecast(
         environment=environment.name,
         profile=recipe.profile,
-        behavior=recipe.behavior["source"],
+        behavior=recipe.behavior.source,
         tasks=len(chosen),
         train=sum(task.split == "train" for task in chosen),
         test=sum(task.split == "test" for task in chosen),

@@ -84,8 +84,8 @@ def _measure(values: dict[str, Any], send: Send) -> str:
         environment=environment,
         tasks=spec.tasks,
         seed=spec.seed,
-        observation=spec.recipe.behavior["observation"],
-        reward=spec.recipe.behavior["reward"],
+        observation=spec.recipe.behavior.observation,
+        reward=spec.recipe.behavior.reward,
         report=clock.report,
         checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
     )

@@ -78,8 +78,8 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
         environment=plan.environment,
         tasks=spec.tasks,
         seed=spec.seed,
-        observation=spec.recipe.behavior["observation"],
-        reward=spec.recipe.behavior["reward"],
+        observation=spec.recipe.behavior.observation,
+        reward=spec.recipe.behavior.reward,
         report=lambda count: report({"kind": "steps", "count": count}),
         checkpoints=lambda tasks: _checkpoints(spec, source, tasks),
     )

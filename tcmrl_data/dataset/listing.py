@@ -29,7 +29,7 @@ def dataset_row(manifest: Manifest, folder: Path) -> dict[str, Any]:
         "path": str(folder),
         "name": manifest.name,
         "profile": manifest.profile,
-        "behavior": manifest.recipe.behavior["source"],
+        "behavior": manifest.recipe.behavior.source,
         "seed": manifest.seed,
         "tasks": len(manifest.tasks),
         "parts": len(manifest.parts),

@@ -222,7 +222,7 @@ def _draw_references(axes: "Axes", dataset: Dataset) -> None:
 
 
 def _heading(dataset: Dataset) -> dict[str, Any]:
-    return {"name": dataset.manifest.name, "environment": dataset.manifest.recipe.environment["name"]}
+    return {"name": dataset.manifest.name, "environment": dataset.name}
 
 
 def _returns(dataset: Dataset, task: int, step: int, recompute: bool) -> dict[str, Any]:

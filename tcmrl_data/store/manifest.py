@@ -11,7 +11,8 @@ from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, canonical_json, dige
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.foundation.records import Record, parse_record
-from tcmrl_data.recipe.recipe import Profile, Recipe
+from tcmrl_data.recipe.profile import Profile
+from tcmrl_data.recipe.recipe import Recipe
 
 SCHEMA_VERSION = 1
 """Raised when the meaning or the layout of a dataset's files changes."""
@@ -208,10 +209,7 @@ class Manifest(Record):
             raise ValueError("tasks and steps must be sorted, each once")
         if keys != sorted(set(keys)):
             raise ValueError("parts must be sorted by task and step, each once")
-        missing = {"source", "observation", "reward", "settings"} - set(self.recipe.behavior)
-        if missing:
-            raise ValueError(f"recipe.behavior lacks {', '.join(sorted(missing))}")
-        if self.recipe.environment.get("name") != self.name:
+        if self.recipe.environment.name != self.name:
             raise ValueError("recipe.environment.name is not the manifest's name")
         tasks, steps = set(indices), set(self.steps)
         if self.root != merkle_root(self.parts):

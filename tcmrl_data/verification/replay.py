@@ -76,7 +76,7 @@ def replay_part(folder: Path, record: PartRecord, manifest: Manifest) -> Replay:
 
 def _check_cost(record: PartRecord, manifest: Manifest) -> None:
     """Refuses lane batches whose buffers the part's size does not justify."""
-    horizon, lanes = manifest.recipe.environment["horizon"], manifest.recipe.rollouts.lanes
+    horizon, lanes = manifest.recipe.environment.horizon, manifest.recipe.rollouts.lanes
     shapes = record.identity.arrays
     columns = shapes["observations"].shape[1] + shapes["actions"].shape[1] + 2
     stored = sum(file.size for file in record.files.values())

@@ -159,7 +159,7 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
     spec = EnvSpec(
         id=f"tcmrl/{dataset.name.replace('/', '-')}-task{task.index:05d}-v0",
         entry_point=f"{__name__}:{make_task.__name__}",
-        kwargs={"settings": dict(recipe.environment), "parameters": dict(task.parameters)},
+        kwargs={"settings": recipe.environment.model_dump(mode="json"), "parameters": dict(task.parameters)},
     )
     references = dataset.references(task.index)
     packages = dataset.part(task.index, selection.steps[task.index][0]).provenance["packages"]
@@ -168,7 +168,7 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
         "eval_env": spec,
         "observation_space": _observation_space(environment.observation_dim),
         "action_space": Box(-1.0, 1.0, (environment.action_dim,), np.float32),
-        "algorithm_name": recipe.behavior["source"],
+        "algorithm_name": recipe.behavior.source,
         "ref_min_score": references.uniform,
         "ref_max_score": _best(references)[1],
         "num_episodes_average_score": recipe.rollouts.episodes,

@@ -1,0 +1,186 @@
+"""Recipe files: TOML that people write, read and merged, but not yet validated."""
+
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tcmrl_data.envs.base import ENVIRONMENTS
+from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
+from tcmrl_data.foundation.validation import nearest
+from tcmrl_data.recipe.profile import PROFILES, Profile
+
+RECIPE_SCHEMA = 1
+REQUIRED_TABLES = ("about", "behavior", "environment", "rollouts")
+TABLES = sorted([*REQUIRED_TABLES, "build", "training"])
+SUFFIX = ".toml"
+"""Ends the name of a recipe file; no environment's name ends in it."""
+
+
+@dataclass(frozen=True)
+class RecipeDocument:
+    """The content of a recipe file, for one environment.
+
+    Attributes:
+        environment: the environment's name.
+        place: what error messages call the document.
+        text: the file's text.
+        content: its tables as they stand in the file, variants and profiles included.
+    """
+
+    environment: str
+    place: str
+    text: str
+    content: Mapping[str, Any]
+
+    @property
+    def profiles(self) -> list[Profile]:
+        """The profiles that the document has."""
+        return [name for name in PROFILES if name == "paper" or name in self.content.get("profiles", {})]
+
+    def layers(self, profile: Profile) -> list[tuple[str, ...]]:
+        """Paths of the tables that are merged for a profile, the later on top of the earlier."""
+        return [(), ("variants", self.environment), ("profiles", profile)]
+
+    def tables(self, profile: Profile, overrides: Sequence[str] = ()) -> dict[str, Any]:
+        """The document's tables with the variant, the profile, and overrides on top.
+
+        Raises:
+            RecipeError: the document lacks the profile or a table, has an unknown table, or a value in the
+                place of a table; or as of `apply_overrides`.
+        """
+        if profile not in self.profiles:
+            raise RecipeError(
+                f"{self.place} has no profile {profile!r}; known are {', '.join(self.profiles)}"
+            )
+        tables: dict[str, Any] = {}
+        for path in self.layers(profile):
+            tables = merge_tables(tables, _table_at(self.content, path))
+        tables = {name: table for name, table in tables.items() if name not in ("profiles", "variants")}
+        tables = apply_overrides(tables, overrides)
+        place = f"{self.place}, profile {profile!r}"
+        for name, table in tables.items():
+            if name not in TABLES:
+                raise RecipeError(f"{place}: unknown table {name!r}; {nearest(name, TABLES)}")
+            if not isinstance(table, Mapping):
+                raise RecipeError(f"{place}: {name} is a value; write it as a table [{name}]")
+        for name in REQUIRED_TABLES:
+            if name not in tables:
+                raise RecipeError(f"{place} lacks the table [{name}]; add it")
+        return tables
+
+
+def open_recipe(name_or_file: str | Path) -> RecipeDocument:
+    """The recipe of an environment, or a recipe file.
+
+    Args:
+        name_or_file: an environment, such as `point-robot`, or the path of a file whose name ends in `.toml`.
+
+    Raises:
+        UnknownNameError: no such environment.
+        RecipeError: no such file, or no recipe in it.
+    """
+    text = str(name_or_file)
+    if text.endswith(SUFFIX):
+        return _open_file(Path(text))
+    file = ENVIRONMENTS.get(text).recipe_file(text)
+    if not file.is_file():
+        raise RecipeError(f"environment {text!r} has no recipe {file.name!r} in manifests/")
+    place = f"recipe of {text!r}"
+    content = file.read_text(encoding="utf-8")
+    return RecipeDocument(text, place, content, _parse(content, place))
+
+
+def _open_file(file: Path) -> RecipeDocument:
+    """A recipe file, which names its environment itself."""
+    try:
+        text = file.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise RecipeError(f"{file} does not exist; name a recipe file or an environment") from None
+    except OSError as error:
+        raise RecipeError(f"{file} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise RecipeError(f"{file} is no TOML: {error.reason} at byte {error.start}") from None
+    content = _parse(text, str(file))
+    table = content.get("environment")
+    name = table.get("name") if isinstance(table, Mapping) else None
+    if not isinstance(name, str):
+        raise RecipeError(f'{file}: [environment] has no name; write for example name = "point-robot"')
+    try:
+        ENVIRONMENTS.get(name)
+    except UnknownNameError as error:
+        raise UnknownNameError(f"{file}: {error}") from None
+    return RecipeDocument(name, str(file), text, content)
+
+
+def _parse(text: str, place: str) -> dict[str, Any]:
+    try:
+        document = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise RecipeError(f"{place} is no TOML: {error}") from None
+    schema = document.pop("schema", None)
+    if schema != RECIPE_SCHEMA:
+        raise RecipeError(f"{place}: schema {schema!r} is not {RECIPE_SCHEMA}")
+    for group in ("profiles", "variants"):
+        members = document.get(group, {})
+        if not isinstance(members, Mapping) or not all(isinstance(one, Mapping) for one in members.values()):
+            raise RecipeError(f"{place}: {group} holds a value; write tables such as [{group}.NAME.rollouts]")
+    unknown = sorted(set(document.get("profiles", {})) - set(PROFILES))
+    if unknown:
+        raise RecipeError(f"{place}: unknown profile {unknown[0]!r}; {nearest(unknown[0], PROFILES)}")
+    return document
+
+
+def apply_overrides(table: Mapping[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    """A copy of nested tables with `section.key=value` texts applied; values are read as TOML.
+
+    Raises:
+        RecipeError: a text without `=`, a value that is no TOML, or a section that is a plain value.
+    """
+    result = merge_tables({}, table)
+    for text in overrides:
+        keys, value = read_override(text)
+        section = result
+        for key in keys[:-1]:
+            section = section.setdefault(key, {})
+            if not isinstance(section, dict):
+                raise RecipeError(f"--set {text!r}: {key!r} is a value, not a section")
+        section[keys[-1]] = value
+    return result
+
+
+def read_override(text: str) -> tuple[list[str], Any]:
+    """The keys and the value of a text `section.key=value`.
+
+    Raises:
+        RecipeError: the text has another form.
+    """
+    path, equals, value = text.partition("=")
+    keys = path.strip().split(".")
+    if not equals or len(keys) < 2 or not all(keys):
+        raise RecipeError(f"--set {text!r}: expected section.key=value, such as rollouts.episodes=10")
+    try:
+        return keys, tomllib.loads(f"value = {value.strip()}")["value"]
+    except tomllib.TOMLDecodeError:
+        return keys, value.strip()  # an unquoted word is a string
+
+
+def merge_tables(base: Mapping[str, Any], top: Mapping[str, Any]) -> dict[str, Any]:
+    """A deep merge: tables merge, everything else is replaced."""
+    result = {
+        key: merge_tables({}, value) if isinstance(value, Mapping) else value for key, value in base.items()
+    }
+    for key, value in top.items():
+        below = result.get(key)
+        if isinstance(value, Mapping):
+            result[key] = merge_tables(below if isinstance(below, Mapping) else {}, value)
+        else:
+            result[key] = value
+    return result
+
+
+def _table_at(content: Mapping[str, Any], path: Sequence[str]) -> Mapping[str, Any]:
+    for key in path:
+        content = content.get(key, {})
+    return content
