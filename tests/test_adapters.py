@@ -263,7 +263,7 @@ def test_minari_recovers_an_environment_with_the_spaces_of_the_data(
 ) -> None:
     """What `check_env_recovery` of Minari's own tests asserts, and that observations lie in their space."""
     minari = pytest.importorskip("minari")
-    minari_format.export(tiny, tmp_path / "out", snapshots="last")
+    MinariFormat().export(tiny, tmp_path / "out", snapshots="last")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
     opened = minari.load_dataset("tcmrl/point-robot/task00040-last-v0")
     original = gymnasium.make(opened.spec.env_spec)

@@ -143,7 +143,8 @@ def test_order_of_tasks_changes_no_context_and_no_loss() -> None:
     plain = batch()
 
     def permuted(values: Steps) -> Steps:
-        return Steps(*(getattr(values, name)[order] for name in values.__dataclass_fields__))
+        fields = {name: getattr(values, name) for name in values.__dataclass_fields__}
+        return Steps(**{name: None if field is None else field[order] for name, field in fields.items()})
 
     moved = with_steps(plain, context=permuted(plain["context"]), execution=permuted(plain["execution"]))
     first, second = losses_of(made, plain), losses_of(made, moved)
