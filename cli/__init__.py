@@ -1,1 +1,1 @@
-"""The commands `tcmrl-data` and `tcmrl`: parse, call one function, print."""
+"""The commands `tcmrl-data` and `tcmrl`: they parse arguments, call the library and print the result."""

@@ -1,4 +1,4 @@
-"""`tcmrl-data plan` and `build`: from a recipe to a dataset."""
+"""`tcmrl-data plan` and `build`: estimate and build the dataset of a recipe."""
 
 import dataclasses
 from collections.abc import Callable
@@ -36,42 +36,44 @@ profile_option = click.option(
     type=click.Choice(PROFILES),
     default="paper",
     show_default=True,
-    help="The recipe as written, or its smaller form.",
+    help="The full recipe (paper) or a smaller version of it.",
 )
 set_option = click.option(
     "--set",
     "overrides",
     metavar="SECTION.KEY=VALUE",
     multiple=True,
-    help="Change a value of the recipe; may be repeated.",
+    help="Override a value of the recipe; repeatable.",
 )
 
 
 def recipe_options(command: Command) -> Command:
-    """Adds the argument ENV|FILE and the options that say what is built and how."""
+    """Adds the argument ENV|FILE and the options that `plan` and `build` share."""
     decorators = (
         recipe_argument,
         profile_option,
         click.option(
             "--behavior",
             type=BEHAVIOR,
-            help="Where the policies come from; the recipe's choice if left out.",
+            show_default="the recipe's",
+            help="Source of the behavior policies.",
         ),
         click.option(
             "--tasks",
             metavar="LIST",
-            help="Indices of the full task set, such as 0-9,12, instead of the profile's choice.",
+            show_default="the profile's",
+            help="Indices of tasks, such as 0-9,12.",
         ),
         set_option,
         click.option(
-            "--workers", type=click.IntRange(min=1), help="Processes at a time; all cores if left out."
+            "--workers", type=click.IntRange(min=1), show_default="all cores", help="Number of processes."
         ),
         click.option(
             "--engine",
             default="local",
             show_default=True,
             type=ENGINE,
-            help="Where the work runs.",
+            help="Engine that runs the work.",
         ),
         output_options,
     )
@@ -93,9 +95,10 @@ def plan(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Say what a build would take, by the recipe of an environment ENV or by a recipe FILE of your own.
+    """Estimate the size, memory and time of a build.
 
-    FILE ends in .toml. The time is estimated from a probe of a few seconds on this machine.
+    ENV is an environment with a recipe, and FILE is a recipe of your own, which ends in .toml. The time is
+    extrapolated from a measurement of a few seconds on this machine.
 
     \b
     Examples:
@@ -113,7 +116,7 @@ def plan(
         print_json(dataclasses.asdict(planned))
         return
     title = f"Plan: {planned.environment}, profile {planned.profile}"
-    table = make_table(title, columns=["what", "how much"], text=["what"], long_text=["how much"])
+    table = make_table(title, columns=["property", "value"], text=["property"], long_text=["value"])
     rows = {
         "behavior": planned.behavior,
         "tasks": f"{planned.tasks:,} ({planned.train:,} train, {planned.test:,} test)",
@@ -137,19 +140,21 @@ def plan(
     "--out",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="The dataset; data/<environment> if left out.",
+    show_default="data/ENV",
+    help="Folder of the dataset.",
 )
 @click.option(
     "--seed",
     type=click.IntRange(min=0, max=2**63 - 1),
     default=0,
     show_default=True,
-    help="Seeds behavior training and rollouts; tasks and split do not depend on it.",
+    help="Seed of behavior training and rollouts; tasks and split do not depend on it.",
 )
 @click.option(
     "--ray-address",
     metavar="ADDRESS",
-    help="A running Ray cluster that shares the dataset's folder; one is started here if left out.",
+    show_default="a new local cluster",
+    help="Address of a running Ray cluster that can access the dataset's folder.",
 )
 def build(
     name_or_file: str,
@@ -165,12 +170,13 @@ def build(
     seed: int,
     ray_address: str | None,
 ) -> None:
-    """Build a dataset, or what is missing of one, by the recipe of an environment ENV or by a recipe FILE.
+    """Build a dataset, or the missing parts of one.
 
-    FILE, a recipe of your own, ends in .toml and names its environment in the table [environment].
+    ENV is an environment with a recipe, and FILE is a recipe of your own. FILE ends in .toml and names its
+    environment in the table [environment].
 
-    A finished dataset is verified and left alone. A build that was stopped goes on when the same command
-    runs again. `--tasks` with other indices extends a dataset.
+    A complete dataset is verified and not changed. If a build was stopped, the same command continues it.
+    With other indices in --tasks, the command adds tasks to the dataset.
 
     \b
     Examples:
@@ -199,13 +205,13 @@ def build(
         print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
     else:
         click.echo(
-            f"{report.dataset}: {report.built:,} parts built, {report.present:,} were there and hold, "
+            f"{report.dataset}: {report.built:,} parts built, {report.present:,} already present and valid, "
             f"in {duration(report.seconds)}; root {report.root[:12]}"
-            f"{'; the folder cannot be written, and nothing had to be' if report.read_only else ''}"
+            f"{'; the folder cannot be written, and no write was needed' if report.read_only else ''}"
         )
     if report.failed:
         more = "" if len(report.failed) == 1 else f" (and {len(report.failed) - 1} more)"
-        fail_incomplete(f"{report.failed[0]}{more}; the same command tries again what is missing")
+        fail_incomplete(f"{report.failed[0]}{more}; run the same command again to build the missing parts")
 
 
 def _parse_tasks(recipe: "Recipe", text: str | None) -> list[int] | None:

@@ -1,4 +1,4 @@
-"""`tcmrl-data cache`: look at and empty the cache of decoded steps."""
+"""`tcmrl-data cache`: list and clear the cache of decoded steps."""
 
 import dataclasses
 import datetime
@@ -12,10 +12,11 @@ from .frame import make_table, output_options, print_json, print_table, remark
 
 @click.group()
 def cache() -> None:
-    """Look at, or empty, the cache of decoded steps that training reads where memory is short.
+    """List or clear the cache of decoded steps.
 
-    It lies in TCMRL_CACHE, or else in tcmrl below the user's cache folder, and takes at most
-    TCMRL_CACHE_LIMIT (100G if not set); what was used longest ago goes first.
+    Training reads data that do not fit in memory from this cache. The environment variable TCMRL_CACHE
+    names its folder (default: tcmrl in the user's cache folder), and TCMRL_CACHE_LIMIT limits its size
+    (default: 100G). The least recently used entries are removed first.
 
     \b
     Examples:
@@ -37,20 +38,25 @@ def list_(as_json: bool, quiet: bool) -> None:
 
     folder, limit, entries = tcmrl_data.cache_folder(), tcmrl_data.cache_limit(), tcmrl_data.list_cache()
     if as_json:
-        rows = [dataclasses.asdict(each) for each in entries]
+        rows = [dataclasses.asdict(entry) for entry in entries]
         print_json({"folder": str(folder), "limit": limit, "entries": rows})
         return
-    total = sum(each.bytes for each in entries)
+    total = sum(entry.bytes for entry in entries)
     title = f"{folder}: {size(total)} of {size(limit)}"
     table = make_table(
         title, columns=["key", "environment", "root", "tasks", "size", "used", "state"],
         text=["key", "environment", "root", "used", "state"],
     )  # fmt: skip
-    for each in entries:
-        used = datetime.datetime.fromtimestamp(each.used).isoformat(" ", "minutes")
-        state = "in use" if each.in_use else ""
+    for entry in entries:
+        used = datetime.datetime.fromtimestamp(entry.used).isoformat(" ", "minutes")
         table.add_row(
-            each.key[:12], each.environment, each.root[:12], str(each.tasks), size(each.bytes), used, state
+            entry.key[:12],
+            entry.environment,
+            entry.root[:12],
+            str(entry.tasks),
+            size(entry.bytes),
+            used,
+            "in use" if entry.in_use else "",
         )
     print_table(table)
 
@@ -58,7 +64,7 @@ def list_(as_json: bool, quiet: bool) -> None:
 @cache.command()
 @output_options
 def clear(as_json: bool, quiet: bool) -> None:
-    """Remove every entry that no process reads.
+    """Remove all entries that no process is using.
 
     \b
     Example:
@@ -73,6 +79,6 @@ def clear(as_json: bool, quiet: bool) -> None:
             {"removed": list(map(dataclasses.asdict, removed)), "kept": list(map(dataclasses.asdict, kept))}
         )
         return
-    click.echo(f"{len(removed)} entries removed, {size(sum(each.bytes for each in removed))}")
+    click.echo(f"{len(removed)} entries removed, {size(sum(entry.bytes for entry in removed))}")
     if kept:
-        remark(f"{len(kept)} entries are in use and stay", quiet=quiet)
+        remark(f"{len(kept)} entries kept, because they are in use", quiet=quiet)

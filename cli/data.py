@@ -28,7 +28,7 @@ def main() -> None:
 @click.group(name="tcmrl-data", context_settings=CONTEXT)
 @click.version_option(package_name="tcmrl")
 def data() -> None:
-    """Make, look at and convert datasets for offline meta-reinforcement learning.
+    """Build, inspect, verify and export datasets for offline meta-reinforcement learning.
 
     \b
     Examples:
@@ -36,7 +36,7 @@ def data() -> None:
       tcmrl-data build point-robot --profile quick
       tcmrl-data inspect returns data/point-robot --plot returns.png
 
-    Exit codes: 0 done, 1 a check failed or work is incomplete, 2 bad usage or bad input.
+    Exit codes: 0 success, 1 failed check or incomplete work, 2 bad usage or bad input.
     """
 
 
@@ -47,7 +47,7 @@ for _command in (plan, build, status, show, inspect, verify, repair, gc, import_
 @data.command()
 @output_options
 def envs(as_json: bool, quiet: bool) -> None:
-    """List the environments that have a recipe, and those that are broken.
+    """List the environments that have a recipe, and the ones that cannot be loaded.
 
     \b
     Example:
@@ -61,7 +61,7 @@ def envs(as_json: bool, quiet: bool) -> None:
         return
     heads = {
         "name": "environment",
-        "observation_dim": "observed",
+        "observation_dim": "observation",
         "action_dim": "action",
         "horizon": "horizon",
         "tasks": "tasks",
@@ -80,7 +80,7 @@ def envs(as_json: bool, quiet: bool) -> None:
 @click.argument("root", type=click.Path(path_type=Path), required=False)
 @output_options
 def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
-    """List the datasets below ROOT (data if left out).
+    """List the datasets in the folder ROOT (default: data) and its subfolders.
 
     \b
     Example:
@@ -89,17 +89,17 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
     import tcmrl_data
 
     if root is not None and not root.is_dir():
-        raise click.ClickException(f"{root} is no folder; name one that holds datasets")
+        raise click.ClickException(f"{root} is not a folder; name a folder that contains datasets")
     root = root or Path("data")
     rows = tcmrl_data.list_datasets(root)
     if as_json:
         print_json({"datasets": rows})
         return
     if not rows:
-        remark(f"no datasets below {root}; build one with `tcmrl-data build ENV`", quiet=quiet)
+        remark(f"no datasets in {root}; build one with `tcmrl-data build ENV`", quiet=quiet)
         return
     table = make_table(
-        f"Datasets below {root}",
+        f"Datasets in {root}",
         columns=["dataset", "built from", "tasks", "parts", "state", "root"],
         text=["root"],
         long_text=["dataset", "built from", "state"],
@@ -117,33 +117,34 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
 
 @data.command()
 @click.argument("dataset", type=click.Path(path_type=Path))
-@click.option("--format", "format_name", required=True, type=FORMAT, help="The format.")
+@click.option("--format", "format_name", required=True, type=FORMAT, help="Export format.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="A new folder; DATASET-FORMAT if left out.",
+    show_default="DATASET-FORMAT",
+    help="Folder to create.",
 )
 @click.option(
     "--snapshots",
     default="all",
     show_default=True,
     metavar="RULE",
-    help="Which snapshots: all, last, steps>=N, or return>=Q with a quantile Q.",
+    help="Snapshots to export: all, last, steps>=N, or return>=Q with a quantile Q.",
 )
 @output_options
 def export(
     dataset: Path, format_name: str, out: Path | None, snapshots: str, as_json: bool, quiet: bool
 ) -> None:
-    """Write DATASET in another format.
+    """Export DATASET to another format.
 
-    DATASET is a folder or its manifest.json. In a new folder, every task becomes one HDF5 file or one
-    Minari dataset; Minari opens them by name when MINARI_DATASETS_PATH names the folder.
+    DATASET is the dataset's folder or its manifest.json. Every task becomes one HDF5 file or one Minari
+    dataset in a new folder. Minari opens its datasets by name if MINARI_DATASETS_PATH is that folder.
 
     \b
     Examples:
-      tcmrl-data export data/point-robot --format hdf5
-      tcmrl-data export data/point-robot --format minari --snapshots last --out minari
+      tcmrl-data export data/point-robot --format hdf5 --snapshots last
+      tcmrl-data export data/point-robot --format minari --out minari
       MINARI_DATASETS_PATH=minari minari list local
     """
     import tcmrl_data

@@ -1,4 +1,4 @@
-"""`tcmrl evaluate`: adapt a run to the test tasks, and show how well it did."""
+"""`tcmrl evaluate`: adapt the policy of a run to the test tasks and print its returns."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 
     from tcmrl_algo import Evaluation, TaskResult
 
-OTHER = "other: the same policy under other tasks' contexts"
-PRIVILEGED = "privileged: a control that sees the parameters of the tasks"
+OTHER = "other: the same policy with the contexts of other tasks"
+PRIVILEGED = "privileged: a control that observes the task parameters"
 SCORES = {
     "regret": "regret: oracle - adapted",
     "normalized": "normalized: 0 is uniform actions, 1 the best behavior policy",
@@ -24,7 +24,7 @@ SCORES = {
 
 
 def score_tables(results: Sequence["Evaluation"]) -> list["Table"]:
-    """One protocol: its test tasks. Several: the means of every protocol, then the test tasks of each."""
+    """Tables of returns by test task, one per protocol; for several protocols, after a table of means."""
     first = results[0]
     mark = " (privileged)" if first.privileged else ""
     run = f"{first.algorithm}{mark} on {first.environment}, seed {first.seed}"
@@ -58,7 +58,7 @@ def _values(task: "TaskResult", score: str, *, with_success: bool) -> list[float
 
 
 def _score(results: Sequence["Evaluation"]) -> str:
-    """What is said of a return: how far it is from the oracle where there is one."""
+    """The score to print: the regret if the environment has an oracle, else the normalized return."""
     tasks = [task for result in results for task in result.tasks]
     return "regret" if any(task.regret is not None for task in tasks) else "normalized"
 
@@ -77,15 +77,20 @@ def _mean(values: Sequence[float | None]) -> float | None:
 @click.option(
     "--protocol",
     type=PROTOCOL,
-    help="How to adapt; the recipe's choice if left out. `all` runs every protocol and compares them.",
+    show_default="the run's",
+    help="Adaptation protocol; `all` evaluates every protocol and compares them.",
 )
 @click.option(
     "--dataset",
     type=click.Path(path_type=Path),
-    help="The dataset the run was trained on, if it has moved.",
+    metavar="FOLDER",
+    help="Folder of the run's dataset, if the dataset was moved.",
 )
 @click.option(
-    "--episodes", type=click.IntRange(min=1), help="Adaptation episodes per task; the recipe's if left out."
+    "--episodes",
+    type=click.IntRange(min=1),
+    show_default="the run's",
+    help="Number of adaptation episodes per task.",
 )
 @output_options
 def evaluate(
@@ -96,12 +101,13 @@ def evaluate(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Adapt the policy in RUN to the test tasks, and score it beside its controls.
+    """Adapt the policy of RUN to the test tasks, and evaluate it.
 
-    A protocol says which trajectories adapt the policy: its own, stored ones, or other tasks' first.
+    The protocol chooses the trajectories that the policy adapts to: trajectories that it collects on the
+    test task, stored trajectories of the test task, or stored trajectories of training tasks.
 
-    Controls: uniform actions, the oracle, and other tasks' contexts. Returns are undiscounted.
-    With --protocol all, --json prints a list of documents.
+    The returns are compared with those of uniform actions, of the oracle, and of the same policy with the
+    contexts of other tasks. Returns are undiscounted. With --protocol all, --json prints a list of documents.
 
     \b
     Examples:
@@ -132,7 +138,7 @@ def evaluate(
 
 
 def _protocols(progress: StageProgress) -> list[str]:
-    """Every protocol that can be used; says which cannot, and why."""
+    """Names of the protocols that can be loaded; reports the others."""
     from tcmrl_algo import PROTOCOLS
 
     for error in PROTOCOLS.broken().values():

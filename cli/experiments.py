@@ -1,4 +1,4 @@
-"""`tcmrl experiment`: many runs, one results folder, one table."""
+"""`tcmrl experiment`: do the runs of an experiment and print tables of their returns."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -29,12 +29,13 @@ NUM_SEEDS = 10_000
 
 @click.command()
 @click.argument("name", metavar="FILE|NAME", required=False)
-@click.option("--list", "as_list", is_flag=True, help="List the experiments that come with the package.")
+@click.option("--list", "as_list", is_flag=True, help="List the experiments of this package.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="The results folder; results/<name> if left out.",
+    show_default="results/NAME",
+    help="Folder of the results.",
 )
 @click.option(
     "--data",
@@ -42,15 +43,22 @@ NUM_SEEDS = 10_000
     default=Path("data"),
     show_default=True,
     metavar="FOLDER",
-    help="Where the datasets lie, each in a folder named after its environment; or the one dataset.",
+    help="Folder that contains a dataset per environment, under its name; or one dataset.",
 )
-@click.option("--workers", type=click.IntRange(min=1), help="Runs at a time; one per core if left out.")
-@click.option("--steps", type=click.IntRange(min=1), help="Training steps of every run, schedules included.")
-@click.option("--seeds", metavar="LIST", help="Seeds such as 0-4 or 0,3, instead of the file's.")
 @click.option(
-    "--only", metavar="LABEL", multiple=True, help="Only the method of this label; may be repeated."
+    "--workers", type=click.IntRange(min=1), show_default="one per core", help="Number of simultaneous runs."
 )
-@click.option("--device", default="cpu", show_default=True, help="A torch device, such as cpu or cuda.")
+@click.option(
+    "--steps",
+    type=click.IntRange(min=1),
+    show_default="the file's",
+    help="Training steps of every run; schedules are scaled to them.",
+)
+@click.option("--seeds", metavar="LIST", show_default="the file's", help="Seeds, such as 0-4 or 0,3.")
+@click.option(
+    "--only", metavar="LABEL", multiple=True, help="Run only the method with this label; repeatable."
+)
+@click.option("--device", default="cpu", show_default=True, help="PyTorch device, such as cpu or cuda.")
 @output_options
 def experiment(
     name: str | None,
@@ -65,19 +73,19 @@ def experiment(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Run an experiment: its methods on its environments under its seeds, several at once.
+    """Run an experiment: every method on every environment with every seed.
 
-    FILE is a TOML file; NAME is one that --list shows. Everything is checked before the first run starts.
-    When the same command runs again, finished runs are kept and killed ones go on from their last
-    checkpoint, and end as if they had never stopped. The cores are shared out among the workers.
+    FILE is a TOML file; NAME is an experiment of --list. All inputs are checked before the first run
+    starts. If the same command is run again, it keeps finished runs and continues interrupted runs from
+    their last checkpoint; the results are those of uninterrupted runs. The workers share the cores.
 
-    The folder holds one JSON document per run in runs/, and table.csv. Returns are undiscounted.
+    The results folder contains a JSON document per run in runs/, and table.csv. Returns are undiscounted.
 
     \b
     Examples:
       tcmrl experiment --list
       tcmrl experiment tour --workers 2
-      tcmrl experiment figure10 --workers 4 --seeds 0-2 --steps 1000 --out results/first-look
+      tcmrl experiment figure10 --seeds 0-2 --steps 1000 --out results/short
       tcmrl experiment mine.toml --data /disk/datasets --only TCMRL --only FOCAL
     """
     from tcmrl_algo import load_experiment, run_experiment
@@ -87,7 +95,7 @@ def experiment(
         _print_list(as_json=as_json)
         return
     if name is None:
-        raise click.UsageError("Name a FILE or an experiment that `tcmrl experiment --list` shows.")
+        raise click.UsageError("Name a FILE or an experiment of `tcmrl experiment --list`.")
     loaded = load_experiment(name)
     out = out or Path("results") / loaded.name
     with stopped_by_signals(lambda: same_command(out)):
@@ -105,18 +113,18 @@ def experiment(
     if as_json:
         print_json(_document(report))
     else:
-        for environment in dict.fromkeys(each.environment for each in report.results):
+        for environment in dict.fromkeys(result.environment for result in report.results):
             for table in result_tables(environment, report.results):
                 print_table(table)
         ran = len(report.results) - report.present
         click.echo(
-            f"{report.out}: {ran} runs done, {report.present} were there, in {duration(report.seconds)}"
+            f"{report.out}: {ran} runs done, {report.present} already present, in {duration(report.seconds)}"
         )
         if report.results:
             remark(f"Next: tcmrl report {report.out}", quiet=quiet)
     if report.failed:
         more = "" if len(report.failed) == 1 else f" (and {len(report.failed) - 1} more)"
-        fail_incomplete(f"{report.failed[0]}{more}; the same command tries again what failed")
+        fail_incomplete(f"{report.failed[0]}{more}; run the same command again to repeat the failed runs")
 
 
 def _print_list(*, as_json: bool) -> None:
@@ -125,13 +133,16 @@ def _print_list(*, as_json: bool) -> None:
     found = [load_experiment(name) for name in experiment_names()]
     if as_json:
         fields = {"name", "title", "source", "environments", "methods", "seeds", "protocols", "claims"}
-        print_json({"experiments": [one.model_dump(mode="json", include=fields) for one in found]})
+        print_json(
+            {"experiments": [experiment.model_dump(mode="json", include=fields) for experiment in found]}
+        )
         return
     table = make_table(
-        "Experiments", columns=["experiment", "asks", "runs"], text=["experiment"], long_text=["asks"]
+        "Experiments", columns=["experiment", "title", "runs"], text=["experiment"], long_text=["title"]
     )
-    for one in found:
-        table.add_row(one.name, one.title, str(len(one.environments) * len(one.methods) * len(one.seeds)))
+    for experiment in found:
+        num_runs = len(experiment.environments) * len(experiment.methods) * len(experiment.seeds)
+        table.add_row(experiment.name, experiment.title, str(num_runs))
     print_table(table)
 
 
@@ -140,7 +151,10 @@ def _line(event: "Finished") -> str:
     if event.result is None:
         return f"{event.done} of {event.total}: {event.id} failed: {event.error}{left}"
     result = event.result
-    finals = ", ".join(f"{name} {number(each['mean_final'])}" for name, each in result.evaluations.items())
+    finals = ", ".join(
+        f"{protocol} {number(evaluation['mean_final'])}"
+        for protocol, evaluation in result.evaluations.items()
+    )
     return (
         f"{event.done} of {event.total}: {result.environment}, {result.method}, seed {result.seed}: "
         f"{finals}{left}"
@@ -159,7 +173,7 @@ def _document(report: "ExperimentReport") -> dict[str, Any]:
 
 
 def result_tables(environment: str, results: Sequence["RunResult"]) -> list["Table"]:
-    """One table per protocol: what every method reaches across seeds, and under others' contexts."""
+    """Returns of all methods across seeds, with their own contexts and those of other tasks; per protocol."""
     from tcmrl_algo import by_method, summarize
 
     here = [result for result in results if result.environment == environment]

@@ -1,4 +1,4 @@
-"""The frame around every command: options they share, one-line errors, exit codes, JSON and tables."""
+"""What all commands share: options, one-line errors, exit codes, JSON and tables."""
 
 import contextlib
 import io
@@ -22,24 +22,27 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 DONE, INCOMPLETE, BAD_INPUT = 0, 1, 2
-"""Exit codes: done; a check failed or work is incomplete; bad usage or bad input."""
+"""Exit codes: success; failed check or incomplete work; bad usage or bad input."""
 
 SPANS = ((86_400, "d", 3_600, "h"), (3_600, "h", 60, "min"), (60, "min", 1, "s"))
-"""Seconds and name of a unit of time, and of the one shown beside it."""
+"""Units of time, longest first: seconds and name of the unit and of the smaller unit printed after it."""
 
 INTERRUPTED = "interrupted; run the same command again"
 
 PIPE_WIDTH = 250
-"""Columns of a table that does not go to a terminal."""
+"""Width of tables that are not printed to a terminal, in columns."""
+
+ONE_DECIMAL = 10_000.0
+"""Smallest number that is printed with one decimal; tables of five-digit returns then fit 80 columns."""
 
 FOLDED_WIDTH = 12
-"""Columns that a folded text keeps where the terminal is narrow."""
+"""Smallest width of a column that folds its text on a narrow terminal."""
 
 
 def main_program(command: click.Command) -> NoReturn:
-    """Runs this process's command line and exits; Ctrl-C and SIGTERM are obeyed once, in order.
+    """Runs this process's command line and exits; the first Ctrl-C or SIGTERM raises KeyboardInterrupt.
 
-    Further ones change nothing: they would break off the very work of stopping.
+    Further signals are ignored, because they would interrupt the cleanup.
     """
     obeyed = False
 
@@ -50,17 +53,19 @@ def main_program(command: click.Command) -> NoReturn:
             raise KeyboardInterrupt
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        if signal.getsignal(number) != signal.SIG_IGN:  # a shell's background work stays there
+        if (
+            signal.getsignal(number) != signal.SIG_IGN
+        ):  # a shell ignores the signal for background jobs: keep that
             signal.signal(number, interrupt)
     try:
         code = run(command)
     except Exception:
         if not obeyed:
             raise
-        code = _fail(INTERRUPTED, INCOMPLETE)  # a library that was broken off may raise anything
+        code = _fail(INTERRUPTED, INCOMPLETE)  # an interrupted library may raise anything
     if obeyed:
         for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, signal.SIG_IGN)  # a handler of ours would not outlive the interpreter's end
+            signal.signal(number, signal.SIG_IGN)  # our handler does not work while the interpreter exits
     sys.exit(code)
 
 
@@ -69,11 +74,11 @@ def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
 
     Args:
         command: the root command.
-        arguments: what follows the program's name; those of this process where None.
+        arguments: the arguments after the program's name; None takes those of this process.
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal without Unicode gets question marks
+            stream.reconfigure(errors="replace")  # prints question marks on a terminal without Unicode
     typed = sys.argv[1:] if arguments is None else list(arguments)
     try:
         result = command.main(args=typed, prog_name=command.name, standalone_mode=False, obj=typed)
@@ -96,42 +101,47 @@ def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
 
 
 def fail_incomplete(message: str) -> None:
-    """Ends the running command with exit code 1 and one line that says what is not as it must be."""
+    """Ends the running command with exit code 1 and a one-line error."""
     click.get_current_context().exit(_fail(message, INCOMPLETE))
 
 
 def typed_command(*more: str) -> str:
-    """The running command as it was typed, to be run again, with more arguments that it does not have yet."""
+    """The running command as the user typed it, with the arguments in `more` that it does not have yet."""
     context = click.get_current_context().find_root()
     return shlex.join(
-        [str(context.info_name), *context.obj, *(each for each in more if each not in context.obj)]
+        [
+            str(context.info_name),
+            *context.obj,
+            *(argument for argument in more if argument not in context.obj),
+        ]
     )
 
 
 def same_command(out: Path) -> str:
-    """That the command that was typed goes on with what it left in a folder."""
-    return f"{out} keeps what is finished, to go on run `{typed_command()}` again"
+    """The message that finished work in a folder is kept, and that the typed command continues it."""
+    return f"finished work is kept in {out}; to continue, run `{typed_command()}` again"
 
 
 @contextlib.contextmanager
-def stopped_by_signals(go_on: Callable[[], str]) -> Iterator[None]:
-    """Lets Ctrl-C and SIGTERM end long work in order, with one line.
+def stopped_by_signals(how_to_continue: Callable[[], str]) -> Iterator[None]:
+    """Turns Ctrl-C and SIGTERM during long work into a one-line error with exit code 1.
 
     Args:
-        go_on: says, once the work has stopped, what is left of it and which command goes on.
+        how_to_continue: called after the work has stopped; returns the state of the work and the command
+            that continues it.
     """
     try:
         yield
     except KeyboardInterrupt:
-        fail_incomplete(f"interrupted; {go_on()}")
+        fail_incomplete(f"interrupted; {how_to_continue()}")
 
 
 def output_options(command: Command) -> Command:
     """Adds `--json` and `--quiet`."""
     as_json = click.option(
-        "--json", "as_json", is_flag=True, help="Print one JSON document and nothing else on standard output."
+        "--json", "as_json", is_flag=True, help="Print one JSON document on standard output."
     )
-    quiet = click.option("--quiet", is_flag=True, help="No progress and no remarks, only results and errors.")
+    quiet = click.option("--quiet", is_flag=True, help="Print only results and errors.")
     return as_json(quiet(command))
 
 
@@ -141,9 +151,9 @@ def print_json(document: Any) -> None:
 
 
 def print_table(table: "Table") -> None:
-    """Prints a table on standard output: as wide as the terminal, or as wide as it needs in a pipe.
+    """Prints a table on standard output, with the width of the terminal, or at full width to a pipe.
 
-    No number is cut: where the columns do not fit, lines are longer than the terminal is wide.
+    Numbers are never cut: if the columns do not fit, the lines are longer than the width of the terminal.
     """
     from rich.console import Console
 
@@ -156,7 +166,7 @@ def print_table(table: "Table") -> None:
     width = max(console.width, console.measure(table).minimum)
     title, table.title = table.title or "", None
     with console.capture() as capture:
-        console.print(title, style="bold")  # by itself: a title of the table would wrap at the table's width
+        console.print(title, style="bold")  # apart: a title of the table wraps at the table's width
         console.print(table, width=width, crop=False)
     lines = capture.get().splitlines()
     click.echo("\n".join(lines if in_terminal else map(str.rstrip, lines)))
@@ -168,10 +178,10 @@ def make_table(
     """An empty table.
 
     Args:
-        title: stands above it.
-        columns: headings, left to right.
-        text: columns that hold words and align left; all others hold numbers and align right.
-        long_text: like `text`, but broken into lines where the terminal is narrow.
+        title: printed above the table.
+        columns: headings from left to right.
+        text: columns of text, aligned left; all other columns hold numbers, aligned right.
+        long_text: like `text`, but folded into lines if the terminal is narrow.
     """
     from rich import box
     from rich.table import Table
@@ -182,28 +192,30 @@ def make_table(
         collapse_padding=True,
         pad_edge=False,
     )
-    words, sentences = set(text), set(long_text)
+    texts, long_texts = set(text), set(long_text)
     for column in columns:
-        if column in sentences:
+        if column in long_texts:
             table.add_column(column, overflow="fold", min_width=FOLDED_WIDTH)
         else:
-            table.add_column(column, justify="left" if column in words else "right", no_wrap=True)
+            table.add_column(column, justify="left" if column in texts else "right", no_wrap=True)
     return table
 
 
 def remark(message: str, *, quiet: bool) -> None:
-    """Says something that is no result, on standard error."""
+    """Prints a message that is not a result on standard error."""
     if not quiet:
         click.echo(message, err=True)
 
 
 def number(value: float | None) -> str:
-    """Two decimals; a dash where there is no value."""
-    return "–" if value is None else f"{value:,.2f}"
+    """Two decimals, or one from 10,000 on; a dash for None."""
+    if value is None:
+        return "–"
+    return f"{value:,.1f}" if abs(value) >= ONE_DECIMAL else f"{value:,.2f}"
 
 
 def duration(seconds: float) -> str:
-    """A time span in its two largest units, such as `3 min 20 s`."""
+    """A duration in its two largest units, such as `3 min 20 s`."""
     whole = round(seconds)
     for long, name, short, short_name in SPANS:
         if whole >= long:

@@ -1,4 +1,4 @@
-"""`tcmrl-data inspect`: what a dataset holds."""
+"""`tcmrl-data inspect`: returns, tasks, snapshots and episodes of a dataset."""
 
 import json
 from collections.abc import Callable
@@ -13,22 +13,20 @@ Command = TypeVar("Command", bound=Callable[..., Any])
 
 
 class _Inspections(click.Group):
-    """A group that says which of its commands a dataset may be given to."""
+    """A group whose error lists its commands if the first argument is a dataset."""
 
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
         if self.get_command(ctx, args[0]) is None and Path(args[0]).exists():
             choices = "|".join(self.commands)
-            raise click.UsageError(
-                f"Write `tcmrl-data inspect {choices} {args[0]}`, with one of these words."
-            )
+            raise click.UsageError(f"Choose a table: `tcmrl-data inspect {choices} {args[0]}`.")
         return super().resolve_command(ctx, args)
 
 
 @click.group(cls=_Inspections)
 def inspect() -> None:
-    """Look at a dataset: its returns, tasks, snapshots or episodes.
+    """Print the returns, tasks, snapshots or episodes of a dataset.
 
     DATASET is the dataset's folder or its manifest.json.
 
@@ -51,13 +49,15 @@ def dataset_command(command: Command) -> Command:
     "--plot",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Also draw the learning curves of all tasks, as .png, .svg or .pdf.",
+    help="Also plot the learning curves of all tasks to a .png, .svg or .pdf file.",
 )
 @click.option(
-    "--recompute", is_flag=True, help="Sum the stored rewards again and compare with the recorded returns."
+    "--recompute",
+    is_flag=True,
+    help="Compute the returns from the stored rewards and compare them with the recorded ones.",
 )
 def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recompute: bool) -> None:
-    """Undiscounted returns per snapshot step, over training and test tasks apart.
+    """Print undiscounted returns by snapshot, for training and test tasks.
 
     \b
     Examples:
@@ -79,7 +79,9 @@ def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recomp
     if recompute:
         difference = first_disagreement(tcmrl_data.return_table(opened), table)
         if difference is not None:
-            fail_incomplete(f"{opened.folder}: {difference}; delete its folder and build again")
+            fail_incomplete(
+                f"{opened.folder}: {difference}; delete the part's folder and run the build again"
+            )
 
 
 def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:
@@ -107,7 +109,7 @@ def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:
 @inspect.command()
 @dataset_command
 def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
-    """Tasks with split, parameters and reference returns.
+    """Print the tasks with split, parameters and reference returns.
 
     \b
     Example:
@@ -129,7 +131,7 @@ def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
     )
     for row in document["tasks"]:
         known = row["references"] or dict.fromkeys(references)
-        values = (number(known[each]) for each in references)
+        values = (number(known[reference]) for reference in references)
         table.add_row(str(row["task"]), row["split"], _shortened(row["parameters"]), *values)
     print_table(table)
 
@@ -137,7 +139,7 @@ def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
 @inspect.command()
 @dataset_command
 def snapshots(dataset: Path, as_json: bool, quiet: bool) -> None:
-    """Every snapshot with the id of its part.
+    """Print the snapshots with the ids of their parts.
 
     \b
     Example:
@@ -160,10 +162,10 @@ def snapshots(dataset: Path, as_json: bool, quiet: bool) -> None:
 
 @inspect.command()
 @dataset_command
-@click.option("--task", type=click.IntRange(min=0), help="Only this task.")
-@click.option("--step", type=click.IntRange(min=0), help="Only snapshots of this step.")
+@click.option("--task", type=click.IntRange(min=0), help="Index of the only task to print.")
+@click.option("--step", type=click.IntRange(min=0), help="Training step of the only snapshots to print.")
 def episodes(dataset: Path, as_json: bool, quiet: bool, task: int | None, step: int | None) -> None:
-    """Every episode: length, return, how it ended, success.
+    """Print the episodes with length, return, kind of end and success.
 
     \b
     Example:
@@ -193,15 +195,15 @@ def episodes(dataset: Path, as_json: bool, quiet: bool, task: int | None, step: 
 
 
 def _shortened(parameters: dict[str, Any]) -> str:
-    """Parameters with floats of three decimals and long lists cut, as one line."""
+    """Parameters in one line, floats with three decimals, lists with at most six items."""
 
     def shorten(value: Any) -> Any:
         if isinstance(value, float):
             return round(value, 3)
         if isinstance(value, list):
-            return [shorten(each) for each in value[:6]] + ["…"] * (len(value) > 6)
+            return [shorten(item) for item in value[:6]] + ["…"] * (len(value) > 6)
         if isinstance(value, dict):
-            return {key: shorten(each) for key, each in value.items()}
+            return {key: shorten(item) for key, item in value.items()}
         return value
 
     return ", ".join(

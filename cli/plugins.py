@@ -1,4 +1,4 @@
-"""Options that take the name of a plug-in."""
+"""Types of options whose values are names of plug-ins."""
 
 from collections.abc import Sequence
 from typing import Any, final
@@ -10,12 +10,12 @@ import click
 class PluginName(click.ParamType):  # type: ignore[type-arg] # generic in newer versions of click only
     """A name that an installed package declares in an entry point group.
 
-    Help and check read the declared names when they are needed, and import no plug-in.
+    Help texts and checks read the declared names when they need them, without importing a plug-in.
 
     Args:
         group: the entry point group, such as `tcmrl.engines`.
-        noun: what an error message calls a plug-in of this group.
-        others: further words that the option takes.
+        noun: kind of plug-in, for error messages.
+        others: further values of the option.
     """
 
     name = "name"
@@ -41,8 +41,6 @@ class PluginName(click.ParamType):  # type: ignore[type-arg] # generic in newer 
 
 ALL_PROTOCOLS = "all"
 
-
-ALGORITHM = PluginName("tcmrl.algorithms", "algorithm")
 BEHAVIOR = PluginName("tcmrl.behavior", "behavior source")
 ENGINE = PluginName("tcmrl.engines", "engine")
 PROTOCOL = PluginName("tcmrl.protocols", "protocol", others=[ALL_PROTOCOLS])

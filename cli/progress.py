@@ -13,20 +13,20 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 PLAIN_SECONDS = 5.0
-"""Plain lines of one stage are at least this far apart."""
+"""Least time between two plain lines of a stage."""
 
 KNOWN_SECONDS, KNOWN_SHARE, LONG_SECONDS = 3.0, 0.05, 60.0
-"""A pace is known once it was seen for so long over this share of a stage, or over any share for a minute."""
+"""A pace is known after 3 s that covered 5% of a stage, or after a minute."""
 
 
 SHORTEST_BAR = 10
-"""Columns that a bar and the gaps beside it take at least where a stage's detail is shown."""
+"""Least width of a bar and its margins next to a stage's detail, in columns."""
 
 
 class Pace:
-    """How fast a stage goes, and how long it still takes, from its first step forward on.
+    """Rate and remaining time of a stage, measured from its first progress on.
 
-    What passes before that step, such as the start of worker processes, tells nothing about the pace.
+    The time before that, such as the start of worker processes, does not count.
     """
 
     def __init__(self, done: float) -> None:
@@ -35,29 +35,29 @@ class Pace:
         self._latest = (0.0, done)
 
     def update(self, done: float) -> None:
-        """Notes how much is done now."""
+        """Records the amount of work done so far."""
         if done > self._before:
             self._latest = (time.monotonic(), done)
             self._first = self._first or self._latest
 
     @property
     def rate(self) -> float | None:
-        """Units per second; None where nothing is known."""
+        """Units per second; None if unknown."""
         if self._first is None or self._latest[0] <= self._first[0]:
             return None
         return (self._latest[1] - self._first[1]) / (self._latest[0] - self._first[0])
 
     def seconds_left(self, total: float) -> float | None:
-        """Until the stage ends; None until the pace is known."""
+        """Seconds until the stage ends; None until the pace is known."""
         if not self.rate or self._first is None:
             return None
         seconds, done = self._latest[0] - self._first[0], self._latest[1] - self._first[1]
-        seen = seconds >= KNOWN_SECONDS and done >= KNOWN_SHARE * (total - self._first[1])
-        return (total - self._latest[1]) / self.rate if seen or seconds >= LONG_SECONDS else None
+        is_known = seconds >= KNOWN_SECONDS and done >= KNOWN_SHARE * (total - self._first[1])
+        return (total - self._latest[1]) / self.rate if is_known or seconds >= LONG_SECONDS else None
 
 
 class StageProgress:
-    """Shows how far the stages of a job are, with rate and time left.
+    """Shows the progress of a job's stages, with rate and remaining time.
 
     Example:
         >>> with StageProgress(quiet=True) as progress:
@@ -85,14 +85,14 @@ class StageProgress:
             self._bars.stop()
 
     def update(self, stage: str, *, done: float, total: float, unit: str, detail: str = "") -> None:
-        """Says how much of a stage is done, in its unit; stages appear with their first update.
+        """Updates the progress of a stage; a stage appears with its first update.
 
         Args:
-            stage: its name.
-            done: how much is done.
-            total: how much there is to do.
-            unit: of both.
-            detail: what else there is to say, in a few words.
+            stage: name of the stage.
+            done: amount of work done.
+            total: amount of work in all.
+            unit: unit of `done` and `total`.
+            detail: a short further text.
         """
         if self._quiet or total <= 0:
             return
@@ -109,7 +109,7 @@ class StageProgress:
         self._bars.update(self._bar_of[stage], completed=done, total=total, words=words)
 
     def note(self, message: str) -> None:
-        """Prints a line that stays, above the bars where there are bars."""
+        """Prints a permanent line, above the bars if there are any."""
         if self._quiet:
             return
         if self._bars is not None:
@@ -137,7 +137,7 @@ def _rate(rate: float) -> str:
 
 
 def _bars() -> "Progress":
-    """Bars of one line each; where the terminal is narrow, the bar gives way, and words are left out."""
+    """Progress bars of one line; on a narrow terminal the bar shrinks and the detail is omitted."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn
     from rich.table import Column
@@ -146,7 +146,7 @@ def _bars() -> "Progress":
     console = Console(stderr=True)
 
     class AmountColumn(ProgressColumn):
-        """Done and total in the stage's unit, its rate, the time that it still takes or took, its detail."""
+        """Amounts done and in all, rate, remaining or total time, and detail of a stage."""
 
         def render(self, task: Task) -> Text:
             words = task.fields["words"]

@@ -1,4 +1,4 @@
-"""`tcmrl report`: tables, figures and verdicts from finished runs."""
+"""`tcmrl report`: write tables, figures and verdicts on finished runs."""
 
 import dataclasses
 from pathlib import Path
@@ -15,7 +15,8 @@ from .progress import StageProgress
     "--out",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    help="Where the report is written; the folder `report` in the first of RUNS if left out.",
+    show_default="report in the first of RUNS",
+    help="Folder of the report.",
 )
 @click.option(
     "--dataset",
@@ -23,19 +24,21 @@ from .progress import StageProgress
     type=click.Path(path_type=Path),
     metavar="FOLDER",
     multiple=True,
-    help="A dataset that has moved since RUNS were trained on it; may be repeated.",
+    help="Folder of a dataset that was moved after the training of RUNS; repeatable.",
 )
 @output_options
 def report(
     runs: tuple[Path, ...], out: Path | None, datasets: tuple[Path, ...], as_json: bool, quiet: bool
 ) -> None:
-    """Write a report on RUNS: results folders of `tcmrl experiment`, or run folders of `tcmrl train`.
+    """Write a report on finished runs.
 
-    report.md holds learning curves, final returns, what the contexts look like (t-SNE) and what the
-    attention rests on, time and memory, the dataset's returns, the paper's figures where the unit is the
-    same, and for each claim of an experiment whether the seeds support it, contradict it or cannot tell.
-    Intervals (95%, bootstrap) come from five seeds or more; fewer seeds are printed themselves. Every
-    table is also a CSV file, every figure a PNG file. Run folders are evaluated anew.
+    RUNS are results folders of `tcmrl experiment`, or run folders of `tcmrl train`.
+
+    report.md contains final returns, learning curves, t-SNE plots of contexts, attention weights, time
+    and memory, the returns of the dataset, the paper's numbers that have the same unit, and a verdict on
+    every claim of an experiment: supported, contradicted, or cannot tell. From five seeds on, 95%
+    bootstrap intervals are printed; with fewer seeds, the values of all seeds. Every table is also
+    written as a CSV file and every figure as a PNG file. Run folders are evaluated first.
 
     \b
     Examples:
@@ -55,12 +58,12 @@ def report(
         )
     if as_json:
         document = dataclasses.asdict(written)
-        print_json(document | {"report": str(written.report), "files": [str(each) for each in written.files]})
+        print_json(document | {"report": str(written.report), "files": [str(file) for file in written.files]})
         return
     for verdict in written.verdicts:
         click.echo(f"{verdict.verdict}: {verdict.claim} ({verdict.environment})")
-    click.echo(f"{written.report}: {len(written.files) - 1} tables and figures beside it")
+    click.echo(f"{written.report}: written, with {len(written.files) - 1} tables and figures")
     remark(
-        "Verdicts compare seed by seed: supported or contradicted where 0 lies outside the interval.",
+        "Verdicts compare methods seed by seed: `cannot tell` means that the 95% interval contains 0.",
         quiet=quiet,
     )

@@ -1,4 +1,4 @@
-"""`tcmrl runs`: which runs there are, and how far they are."""
+"""`tcmrl runs`: list runs and their progress."""
 
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from .frame import make_table, number, output_options, print_json, print_table, 
 @click.argument("root", type=click.Path(path_type=Path), required=False)
 @output_options
 def runs(root: Path | None, as_json: bool, quiet: bool) -> None:
-    """List the runs below ROOT (runs if left out), with their last evaluation.
+    """List the runs in the folder ROOT (default: runs) and its subfolders.
 
     \b
     Examples:
@@ -22,17 +22,17 @@ def runs(root: Path | None, as_json: bool, quiet: bool) -> None:
     from tcmrl_algo.training.listing import list_runs
 
     if root is not None and not root.is_dir():
-        raise click.ClickException(f"{root} is no folder; name one that holds runs")
+        raise click.ClickException(f"{root} is not a folder; name a folder that contains runs")
     root = root or Path("runs")
     rows = list_runs(root)
     if as_json:
         print_json({"runs": rows})
         return
     if not rows:
-        remark(f"no runs below {root}; make one with `tcmrl train DATASET`", quiet=quiet)
+        remark(f"no runs in {root}; train one with `tcmrl train DATASET`", quiet=quiet)
         return
     table = make_table(
-        f"Runs below {root}",
+        f"Runs in {root}",
         columns=["run", "trained", "steps", "dataset", "last return"],
         text=["dataset"],
         long_text=["run", "trained"],

@@ -1,4 +1,4 @@
-"""`tcmrl-data show`: a dataset on one screen, and what can be done with it."""
+"""`tcmrl-data show`: print a summary of a dataset and the next commands."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,9 @@ from .frame import make_table, output_options, print_json, print_table, remark
 @click.argument("dataset", type=click.Path(path_type=Path))
 @output_options
 def show(dataset: Path, as_json: bool, quiet: bool) -> None:
-    """Show on one screen what DATASET is: recipe, tasks, sizes, root, and with what it was made.
+    """Print a summary of DATASET.
+
+    The summary contains recipe, tasks, sizes and root of the dataset, and software and CPU of its build.
 
     \b
     Examples:
@@ -31,7 +33,7 @@ def show(dataset: Path, as_json: bool, quiet: bool) -> None:
         print_json(document)
         return
     title = printable(str(opened.folder))
-    table = make_table(title, columns=["what", "value"], text=["what"], long_text=["value"])
+    table = make_table(title, columns=["property", "value"], text=["property"], long_text=["value"])
     for name, value in _rows(document).items():
         table.add_row(name, printable(value))
     print_table(table)
@@ -53,12 +55,12 @@ def _rows(document: dict[str, Any]) -> dict[str, str]:
         "root": document["root"],
     }
     if made["created"]:
-        rows["made"] = " to ".join(dict.fromkeys((made["created"][0], made["created"][-1])))
-    labels = {"cpu": "on", "platform": "under", "packages": "with"}
+        rows["built"] = " to ".join(dict.fromkeys((made["created"][0], made["created"][-1])))
+    labels = {"cpu": "CPU", "platform": "platform", "packages": "packages"}
     return rows | {label: "; ".join(made[key]) for key, label in labels.items() if made[key]}
 
 
 def _next_commands(folder: Path, document: dict[str, Any]) -> list[str]:
     if not document["complete"]:
-        return [f"the `tcmrl-data build {document['name']}` command that began it goes on"]
+        return [f"run the `tcmrl-data build {document['name']}` command of this dataset again"]
     return [f"tcmrl-data inspect returns {folder}", f"tcmrl-data verify {folder}", f"tcmrl train {folder}"]

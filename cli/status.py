@@ -1,4 +1,4 @@
-"""`tcmrl-data status`: how far a build is, asked from anywhere."""
+"""`tcmrl-data status`: print the progress of a build, from any process."""
 
 import dataclasses
 import time
@@ -15,7 +15,7 @@ from .frame import duration, make_table, output_options, print_json, print_table
 @click.argument("dataset", type=click.Path(path_type=Path))
 @output_options
 def status(dataset: Path, as_json: bool, quiet: bool) -> None:
-    """Show how far the build of DATASET is, while it runs or after it ended.
+    """Print the progress of the build of DATASET, during the build or after it.
 
     \b
     Examples:
@@ -32,7 +32,9 @@ def status(dataset: Path, as_json: bool, quiet: bool) -> None:
     if found.builder:
         state = f"being built by {found.builder}"
     else:
-        state = "complete" if found.complete else "incomplete; the same `tcmrl-data build` goes on"
+        state = (
+            "complete" if found.complete else "incomplete; run the same `tcmrl-data build` again to continue"
+        )
     rows = {
         "environment": found.environment,
         "state": state,
@@ -40,9 +42,9 @@ def status(dataset: Path, as_json: bool, quiet: bool) -> None:
         "running": ", ".join(found.running) or "nothing",
         "rate": "unknown" if rate is None else f"{rate:,.0f} training steps/s",
         "time left": "unknown" if left is None else f"about {duration(left)}",
-        "last word": "none" if updated is None else f"{duration(max(0.0, time.time() - updated))} ago",
+        "last update": "none" if updated is None else f"{duration(max(0.0, time.time() - updated))} ago",
     }
-    table = make_table(str(dataset), columns=["what", "now"], text=["what"], long_text=["now"])
+    table = make_table(str(dataset), columns=["property", "value"], text=["property"], long_text=["value"])
     for name, value in rows.items():
         table.add_row(name, printable(value))
     for failure in found.failed:

@@ -1,4 +1,4 @@
-"""`tcmrl` and its first command: meta-train on a dataset's manifest."""
+"""`tcmrl` and `tcmrl train`: meta-train on a dataset."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -37,7 +37,7 @@ def main() -> None:
 @click.group(name="tcmrl", context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
 @click.version_option(package_name="tcmrl")
 def tcmrl() -> None:
-    """Meta-train on a dataset made by `tcmrl-data build`, and adapt to its test tasks.
+    """Meta-train on a dataset of `tcmrl-data build`, and adapt to its test tasks.
 
     \b
     Examples:
@@ -47,7 +47,7 @@ def tcmrl() -> None:
       tcmrl experiment figure5 --workers 2
       tcmrl report results/figure5
 
-    Exit codes: 0 done, 1 work is incomplete, 2 bad usage or bad input.
+    Exit codes: 0 success, 1 incomplete work, 2 bad usage or bad input.
     """
 
 
@@ -59,36 +59,41 @@ tcmrl.add_command(runs)
 
 @tcmrl.command()
 @click.argument("manifest", metavar="MANIFEST", type=click.Path(path_type=Path))
-@click.option("--algo", type=ALGORITHM, help="The method; the recipe's if left out.")
+@click.option("--algo", type=ALGORITHM, show_default="the recipe's", help="Method to train.")
 @click.option(
     "--profile",
     type=click.Choice(PROFILES),
-    help="Whose training table to use; the one the dataset was built with if left out.",
+    show_default="the dataset's",
+    help="Profile of the training settings.",
 )
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
-    help="Stop here instead of at run.steps; the learning rate's schedule stays that of run.steps.",
+    show_default="run.steps",
+    help="Step to stop at; schedules still use run.steps.",
 )
-@click.option("--device", help="A torch device, such as cpu (default) or cuda.")
+@click.option("--device", show_default="cpu", help="PyTorch device, such as cpu or cuda.")
 @click.option(
     "--memory-limit",
     metavar="SIZE",
-    help="Read data that take more, such as 2G, through the cache; half of the available memory if left out.",
+    show_default="half of the available memory",
+    help="Size such as 2G; larger data are read through the cache.",
 )
 @click.option(
     "--set",
     "overrides",
     metavar="SECTION.KEY=VALUE",
     multiple=True,
-    help="Change a value of the training table; may be repeated.",
+    help="Override a training setting; repeatable.",
 )
-@click.option("--resume", is_flag=True, help="Go on from the newest checkpoint in --out.")
-@click.option("--seed", type=click.IntRange(min=0), help="Seed of everything random; 0 if left out.")
+@click.option("--resume", is_flag=True, help="Continue from the newest checkpoint in --out.")
+@click.option("--seed", type=click.IntRange(min=0), show_default="0", help="Seed of all random numbers.")
 @click.option(
     "--out",
     type=click.Path(path_type=Path),
-    help="The run's folder; runs/<environment>-<algorithm>-seed<seed> if left out.",
+    metavar="FOLDER",
+    show_default="runs/ENV-ALGO-seedSEED",
+    help="Folder of the run.",
 )
 @output_options
 def train(
@@ -105,30 +110,28 @@ def train(
     as_json: bool,
     quiet: bool,
 ) -> None:
-    """Meta-train on the training tasks of a dataset, MANIFEST (its folder or manifest.json).
+    """Meta-train on the training tasks of a dataset.
 
-    The dataset carries the training table of its recipe; --set changes single values of it. Ctrl-C and
-    SIGTERM save a checkpoint. A run that was stopped or killed goes on with --resume, and ends as if it had
-    never stopped.
+    MANIFEST is the dataset's folder or its manifest.json. The training settings are those of the dataset's
+    recipe; --set overrides single values. Ctrl-C and SIGTERM save a checkpoint. --resume continues a run
+    that was stopped or killed; the result is that of an uninterrupted run.
 
     \b
     Examples:
       tcmrl train data/point-robot --seed 1
       tcmrl train data/point-robot --algo no_context
-      tcmrl train data/half-cheetah-vel --set batch.window_length=8 --set tcmrl.latent=40
+      tcmrl train data/half-cheetah-vel --set batch.window_length=8
       tcmrl train data/point-robot --seed 1 --resume
     """
     from tcmrl_data import open_dataset, parse_bytes
 
     limit = parse_bytes(memory_limit) if memory_limit else None
     if resume and not manifest.exists():
-        raise click.ClickException(
-            f"nothing lies at {manifest}; name the folder where the run's dataset lies now"
-        )
+        raise click.ClickException(f"{manifest} does not exist; name the present folder of the run's dataset")
     dataset = open_dataset(manifest)
     config = _config(dataset, algo=algo, profile=profile, overrides=overrides)
     folder = out or Path("runs") / f"{dataset.name}-{config.settings.run.algorithm}-seed{seed or 0}"
-    with stopped_by_signals(lambda: _how_to_go_on(folder)), StageProgress(quiet=quiet) as progress:
+    with stopped_by_signals(lambda: _how_to_continue(folder)), StageProgress(quiet=quiet) as progress:
         if resume:
             report = _resume(
                 folder,
@@ -210,15 +213,13 @@ def _resume(
     from tcmrl_algo import open_run, resume_run
 
     record = open_run(folder).record
-    for name, asked, recorded in (
+    for name, given, recorded in (
         ("--algo", algo, record.config.settings.run.algorithm),
         ("--profile", profile, record.profile),
         ("--seed", seed, record.seed),
     ):
-        if asked is not None and asked != recorded:
-            raise click.UsageError(
-                f"{folder} is a run with {name} {recorded}, not {asked}; leave {name} out."
-            )
+        if given is not None and given != recorded:
+            raise click.UsageError(f"{folder} is a run with {name} {recorded}, not {given}; omit {name}.")
     _check_settings(folder, record.config, overrides)
     return resume_run(
         folder,
@@ -232,25 +233,25 @@ def _resume(
 
 
 def _check_settings(folder: Path, config: "TrainingConfig", overrides: Sequence[str]) -> None:
-    """Refuses `--set` options under which a run was not begun."""
+    """Refuses `--set` options that differ from the settings of a run."""
     from tcmrl_algo import resolve
 
     tables = config.settings.model_dump() | {config.settings.run.algorithm: config.method}
     for text in overrides:
         if resolve(tables, place=f"--set {text}", overrides=[text]) != config:
             raise click.UsageError(
-                f"{folder} was not begun with --set {text}; leave it out, or train anew in another --out."
+                f"{folder} was not trained with --set {text}; omit it, or train a new run in another --out."
             )
 
 
-def _how_to_go_on(folder: Path) -> str:
+def _how_to_continue(folder: Path) -> str:
     from tcmrl_algo import open_run
 
     if not (folder / "run.json").is_file():
-        return f"nothing was trained yet, to start run `{typed_command()}` again"
+        return f"no step was trained; to start, run `{typed_command()}` again"
     checkpoints = open_run(folder).checkpoints()
     step = checkpoints[-1].step if checkpoints else 0
-    return f"to go on from step {step:,} run `{typed_command('--resume')}`"
+    return f"to continue from step {step:,}, run `{typed_command('--resume')}`"
 
 
 def _show(progress: StageProgress, event: "Progress") -> None:

@@ -1,4 +1,4 @@
-"""`tcmrl-data verify`, `repair`, `gc`, `import-policy`: trust a dataset, mend it, tidy it, take policies."""
+"""`tcmrl-data verify`, `repair`, `gc` and `import-policy`."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -21,21 +21,24 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path))
 
 @click.command()
 @DATASET
-@click.option("--quick", is_flag=True, help="Names, sizes, links and the allow-list only; no file is hashed.")
-@click.option("--deep", is_flag=True, help="Also decode every array and check what it says.")
+@click.option(
+    "--quick", is_flag=True, help="Check only names, sizes, links and the allow-list; hash no file."
+)
+@click.option("--deep", is_flag=True, help="Also decode every array and check its values.")
 @click.option(
     "--replay",
     type=click.IntRange(min=0),
     default=0,
     metavar="N",
-    help="Also make N parts again from their snapshots and seeds, and compare.",
+    help="Also regenerate N parts from their snapshots and seeds, and compare them.",
 )
 @output_options
 def verify(dataset: Path, as_json: bool, quiet: bool, quick: bool, deep: bool, replay: int) -> None:
-    """Find everything that is wrong with DATASET, and name the files.
+    """Check DATASET, and list every damaged, missing or foreign file.
 
-    By default every file is hashed. A replay is compared bit for bit on the CPU model, packages and physics
-    of the original, elsewhere within a tolerance. Nothing is changed. Exit code 1 where anything is found.
+    By default every file is hashed. A replay must be equal bit for bit if CPU model, packages and physics
+    are those of the original, else equal within a tolerance. The dataset is not changed. The exit code is
+    1 if a problem is found.
 
     \b
     Examples:
@@ -57,10 +60,10 @@ def verify(dataset: Path, as_json: bool, quiet: bool, quick: bool, deep: bool, r
     else:
         for finding in report.findings:
             click.echo(f"{printable(finding.file)}: {printable(finding.problem)}")
-        for each in report.replays:
-            how = "bit for bit" if each.exact else "within the tolerance for another platform"
-            result = "differs" if each.problems else "is the same"
-            click.echo(f"replay of task {each.task}, step {each.step}: {result}, compared {how}")
+        for replayed in report.replays:
+            how = "bit for bit" if replayed.exact else "within the tolerance for another platform"
+            result = "differs" if replayed.problems else "is equal"
+            click.echo(f"replay of task {replayed.task}, step {replayed.step}: {result}, compared {how}")
         click.echo(
             f"{printable(str(report.dataset))}: {report.parts:,} parts, {report.files:,} files, "
             f"{size(report.bytes)}, level {report.level}, in {duration(report.seconds)}: "
@@ -69,22 +72,22 @@ def verify(dataset: Path, as_json: bool, quiet: bool, quick: bool, deep: bool, r
     if report.findings:
         fail_incomplete(
             f"{report.dataset}: {_count(report.findings)}; `tcmrl-data repair {report.dataset}` "
-            "makes damaged parts again, foreign files are yours to delete"
+            "regenerates damaged parts; delete foreign files yourself"
         )
 
 
 @click.command()
 @DATASET
-@click.option("--deep", is_flag=True, help="Reject what `verify --deep` rejects.")
-@click.option("--workers", type=click.IntRange(min=1), help="Processes at a time; all cores if left out.")
+@click.option("--deep", is_flag=True, help="Check as `verify --deep` does.")
+@click.option("--workers", type=click.IntRange(min=1), show_default="all cores", help="Number of processes.")
 @output_options
 def repair(dataset: Path, as_json: bool, quiet: bool, deep: bool, workers: int | None) -> None:
-    """Make the parts of DATASET again that verification rejects.
+    """Regenerate the damaged parts of DATASET.
 
-    Recipe and seed are the manifest's, and the new parts must have the old ids before they replace
-    anything. Foreign files are named and left. A damaged manifest.json cannot be repaired: delete it and
-    the part folders that `verify` names, then run the first `tcmrl-data build` again, which takes in all
-    parts that hold.
+    Parts are regenerated from the recipe and the seed in the manifest, and replace the damaged parts only
+    if they have the same ids. Foreign files are listed and kept. A damaged manifest.json cannot be
+    repaired: delete it and the part folders that `verify` lists, then run the original `tcmrl-data build`
+    again, which keeps all valid parts.
 
     \b
     Example:
@@ -103,30 +106,31 @@ def repair(dataset: Path, as_json: bool, quiet: bool, deep: bool, workers: int |
         print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
     else:
         for task, step in report.repaired:
-            click.echo(f"task {task}, step {step}: made again, same id")
+            click.echo(f"task {task}, step {step}: regenerated, same id")
         for file in report.groups:
-            click.echo(f"{file}: written again")
+            click.echo(f"{file}: rewritten")
         for finding in report.left:
-            click.echo(f"{printable(finding.file)}: left, {printable(finding.problem)}")
+            click.echo(f"{printable(finding.file)}: kept, {printable(finding.problem)}")
         click.echo(
-            f"{printable(str(report.dataset))}: {len(report.repaired):,} parts made again, "
-            f"{len(report.groups):,} group records written, {_count(report.left)} left"
-            f"{'; the folder cannot be written, and nothing had to be' if report.read_only else ''}"
+            f"{printable(str(report.dataset))}: {len(report.repaired):,} parts regenerated, "
+            f"{len(report.groups):,} group records rewritten, {_count(report.left)} not repaired"
+            f"{'; the folder cannot be written, and no write was needed' if report.read_only else ''}"
         )
     if report.failed:
-        fail_incomplete(f"{report.failed[0]}; the same command goes on from there")
+        fail_incomplete(f"{report.failed[0]}; run the same command again to continue")
     if report.left:
-        fail_incomplete(f"{report.dataset}: {_count(report.left)} that a repair does not touch")
+        fail_incomplete(f"{report.dataset}: {_count(report.left)} that `repair` cannot resolve")
 
 
 @click.command()
 @DATASET
-@click.option("--dry-run", is_flag=True, help="Only say what would be removed.")
+@click.option("--dry-run", is_flag=True, help="Only list what would be removed.")
 @output_options
 def gc(dataset: Path, as_json: bool, quiet: bool, dry_run: bool) -> None:
-    """Remove what ended builds of DATASET left behind: abandoned staging, checkpoints of finished tasks.
+    """Remove the leftovers of ended builds of DATASET.
 
-    Refused while a process works on the dataset.
+    Leftovers are abandoned staging folders and the checkpoints of finished tasks. The command refuses to
+    run while a process works on the dataset.
 
     \b
     Example:
@@ -135,13 +139,13 @@ def gc(dataset: Path, as_json: bool, quiet: bool, dry_run: bool) -> None:
     import tcmrl_data
 
     found = tcmrl_data.collect_garbage(dataset, dry_run=dry_run)
-    total = sum(each.bytes for each in found)
+    total = sum(item.bytes for item in found)
     if as_json:
-        rows = [dataclasses.asdict(each) for each in found]
+        rows = [dataclasses.asdict(item) for item in found]
         print_json({"dataset": str(dataset), "dry_run": dry_run, "removed": rows, "bytes": total})
         return
-    for each in found:
-        click.echo(f"{printable(each.path)}: {size(each.bytes)}, {each.reason}")
+    for item in found:
+        click.echo(f"{printable(item.path)}: {size(item.bytes)}, {item.reason}")
     verb = "would be removed" if dry_run else "removed"
     click.echo(f"{printable(str(dataset))}: {len(found):,} items, {size(total)} {verb}")
 
@@ -149,21 +153,27 @@ def gc(dataset: Path, as_json: bool, quiet: bool, dry_run: bool) -> None:
 @click.command(name="import-policy")
 @click.argument("zip_file", metavar="ZIP", type=click.Path(path_type=Path))
 @click.option(
-    "--trust-pickle", is_flag=True, help="ZIP holds pickles, which run code when read: say that you trust it."
+    "--trust-pickle",
+    is_flag=True,
+    help="Trust the author of ZIP: it contains pickles, which can run any code.",
 )
-@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FOLDER", help="A new folder.")
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, metavar="FOLDER", help="Folder to create."
+)
 @click.option(
     "--observation",
     type=click.Choice(["stored", "full"]),
     default="stored",
     show_default=True,
-    help="What the policy was trained to see.",
+    help="Observation that the policy was trained on.",
 )
 @output_options
 def import_policy(
     zip_file: Path, as_json: bool, quiet: bool, trust_pickle: bool, out: Path, observation: str
 ) -> None:
-    """Turn the SAC actor in a Stable-Baselines3 ZIP into policy.json and policy.safetensors.
+    """Convert the SAC actor of a Stable-Baselines3 ZIP to a policy.
+
+    The new folder contains policy.json and policy.safetensors, which hold no pickle.
 
     \b
     Example:
@@ -171,7 +181,7 @@ def import_policy(
     """
     if not trust_pickle:
         raise click.ClickException(
-            f"{zip_file} may run any code when it is read; pass --trust-pickle if you trust its author"
+            f"{zip_file} can run any code when it is read; pass --trust-pickle if you trust its author"
         )
     import tcmrl_data
 
@@ -185,7 +195,7 @@ def import_policy(
 
 def _level(*, quick: bool, deep: bool) -> "VerifyLevel":
     if quick and deep:
-        raise click.UsageError("--quick and --deep exclude each other")
+        raise click.UsageError("--quick and --deep cannot be combined; pass one of them")
     return "quick" if quick else "deep" if deep else "digests"
 
 

@@ -56,7 +56,7 @@ def test_build_reports_and_a_second_build_finds_everything(call: Call, tmp_path:
     assert (report["built"], report["present"], report["failed"]) == (6, 0, [])
     code, output, _ = call(*command, "--quiet")
     assert code == 0
-    assert "0 parts built, 6 were there" in output
+    assert "0 parts built, 6 already present" in output
     assert report["root"][:12] in output
 
 
@@ -124,7 +124,7 @@ def test_list_without_datasets_says_how_to_get_one(
     code, output, errors = call("list")
     assert (code, output) == (0, "")
     assert "tcmrl-data build" in errors
-    assert_refused(call("list", tmp_path / "nothing"), "nothing", "is no folder")
+    assert_refused(call("list", tmp_path / "nothing"), "nothing", "is not a folder")
 
 
 def test_export_writes_files_and_reports_them(call: Call, tiny: Dataset, tmp_path: Path) -> None:

@@ -223,7 +223,7 @@ def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
         _, errors = driver.communicate(timeout=PATIENCE)
     told = [line for line in errors.splitlines() if line.startswith("Error:")]
     again = shlex.join(["tcmrl-data", *command, "--quiet"])
-    assert told == [f"Error: interrupted; {out} keeps what is finished, to go on run `{again}` again"]
+    assert told == [f"Error: interrupted; finished work is kept in {out}; to continue, run `{again}` again"]
     assert "Traceback" not in errors
     assert driver.returncode == 1
     assert worker_pids(engine.mark) == []

@@ -272,7 +272,7 @@ def test_a_privileged_control_is_marked_wherever_its_returns_stand(
     code, output, errors = call("evaluate", folder, "--protocol", "all")
     assert code == 0
     assert "double_informed (privileged) on point-robot" in " ".join(output.split())
-    assert "privileged: a control that sees the parameters of the tasks" in errors
+    assert "privileged: a control that observes the task parameters" in errors
     assert json.loads(call("evaluate", folder, "--json")[1])["privileged"] is True
     assert open_run(folder).record.privileged
     assert not open_run(trained).record.privileged

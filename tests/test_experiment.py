@@ -88,7 +88,7 @@ def test_a_second_call_does_nothing_and_says_the_same(
     assert len(document["rows"]) == 8
     assert {each: each.stat().st_mtime_ns for each in finished.glob("runs/*.json")} == before
     code, output, errors = call("experiment", file, "--out", finished)
-    assert "TCMRL" in output and "0 runs done, 4 were there" in output
+    assert "TCMRL" in output and "0 runs done, 4 already present" in output
 
 
 def test_tables_by_protocol_fit_a_terminal_with_every_number_whole(
@@ -116,7 +116,7 @@ def test_long_returns_with_intervals_fit_a_terminal(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     (result, *_) = read_results(finished, _small(tiny_folder))
-    far = {"mean_final": -1234.56, "mean_shuffled": -5432.1, "mean_regret": 9876.54}
+    far = {"mean_final": -12345.67, "mean_shuffled": -54321.09, "mean_regret": 98765.43}
     runs = [
         result.model_copy(
             update={
@@ -134,7 +134,7 @@ def test_long_returns_with_intervals_fit_a_terminal(
     output = capsys.readouterr().out
     assert_fits(output)
     assert "(privileged)" in output
-    assert "-1,234.56 to -1,234.56" in output and "9,876.54" in output
+    assert "-12,345.7 to -12,345.7" in output and "-54,321.1" in output and "98,765.4" in output
 
 
 def test_other_settings_or_data_are_refused_by_name(
@@ -286,7 +286,7 @@ def test_a_failed_run_is_told_and_tried_again(tiny_folder: Path, tmp_path: Path,
     arguments = ["experiment", file, "--out", out, "--only", "broken"]
     code, output, errors = call(*arguments)
     assert code == 1
-    assert "at step" in errors and "tries again" in errors
+    assert "at step" in errors and "run the same command again" in errors
     assert "Next:" not in output + errors
     assert not list(out.glob("runs/*.json"))
     assert "at step" in (out / "runs/point-robot--broken--seed0/error.txt").read_text()
@@ -327,7 +327,7 @@ def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
         _, errors = process.communicate(timeout=PATIENCE)
     wait_for(lambda: not marked_pids(own), "the end of all workers")
     assert process.returncode == (1 if end == signal.SIGINT else -signal.SIGKILL)
-    assert ("to go on run" in errors) == (end == signal.SIGINT)
+    assert ("to continue, run" in errors) == (end == signal.SIGINT)
     assert not folder.with_name(f"{folder.name}.json").exists()
     assert open_run(folder).newest().step in (10, 20)
     experiment = read_experiment(content, place="test")

@@ -73,7 +73,7 @@ def test_a_finished_dataset_that_is_read_only_needs_no_build_and_no_repair(tiny_
     assert (report["built"], report["present"], report["read_only"]) == (0, 15, True)
     repaired = run_mounted(read_only(tiny_folder), "repair", tiny_folder)
     assert repaired.returncode == 0, repaired.stderr
-    assert "0 parts made again" in repaired.stdout and "cannot be written" in repaired.stdout
+    assert "0 parts regenerated" in repaired.stdout and "cannot be written" in repaired.stdout
 
 
 def test_a_read_only_dataset_that_lacks_parts_is_refused_by_name(tiny_copy: Callable[[], Path]) -> None:

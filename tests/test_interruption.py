@@ -86,7 +86,7 @@ def test_the_command_that_an_interrupted_training_prints_goes_on(
     line = errors.strip().splitlines()[-1]
     assert (process.returncode, output) == (1, "")
     assert "Traceback" not in errors
-    assert line.startswith(f"Error: interrupted; to go on from step {step:,} run `tcmrl train ")
+    assert line.startswith(f"Error: interrupted; to continue from step {step:,}, run `tcmrl train ")
     again = shlex.split(re.search("`(.*)`", line)[1])[1:]  # type: ignore[index]
     assert again == [*typed, "--resume"]
     code, _, errors = call(*again, "--steps", step + 5)
@@ -106,7 +106,9 @@ def test_a_build_interrupted_until_it_ends_gives_one_line_and_exit_code_1(tmp_pa
         output, errors = process.communicate(timeout=PATIENCE)
     assert (process.returncode, output) == (1, "")
     assert "Traceback" not in errors
-    assert errors.strip().splitlines()[-1].startswith(f"Error: interrupted; {folder} keeps what is finished")
+    assert (
+        errors.strip().splitlines()[-1].startswith(f"Error: interrupted; finished work is kept in {folder}")
+    )
 
 
 def _logged(folder: Path) -> bool:
@@ -121,9 +123,9 @@ def test_resuming_takes_the_settings_of_the_run_and_no_others(
     again = ("train", tiny_folder, "--out", folder, "--steps", 10)
     assert_refused(call(*again), "--resume")
     gone = ("train", tmp_path / "gone", "--resume", "--out", folder)
-    assert_refused(call(*gone), "gone", "where the run's dataset lies now")
+    assert_refused(call(*gone), "gone", "present folder of the run's dataset")
     refused = call(*again, "--resume", "--set", SMALL[0], "--set", "tcmrl.latent=5")
-    assert_refused(refused, "tcmrl.latent=5", "leave it out")
+    assert_refused(refused, "tcmrl.latent=5", "omit it")
     assert_refused(call(*again, "--resume", "--profile", "paper"), "--profile quick")
     assert call(*again, "--resume", *SETTINGS, "--profile", "quick")[0] == 0
     assert open_run(folder).newest().step == 10

@@ -374,7 +374,7 @@ def test_the_list_of_runs_says_how_far_they_are(start: Train, tmp_path: Path, ca
     output = call("runs", tmp_path)[1]
     assert "tcmrl on point-robot, seed 3" in output and "10/10" in output and "idaq -2.50" in output
     assert first["root"][:12] in output
-    assert_refused(call("runs", tmp_path / "nothing"), "nothing", "is no folder")
+    assert_refused(call("runs", tmp_path / "nothing"), "nothing", "is not a folder")
 
 
 def test_resume_refuses_another_seed(start: Train, tiny_folder: Path, call: Call) -> None:

@@ -385,7 +385,7 @@ def test_the_commands_say_what_they_found_and_did(
         {"file": name, "problem": "is missing", "task": 3, "step": 0, "foreign": False}
     ]
     assert run(data, ["repair", str(folder), "--workers", "1", "--quiet"]) == 0
-    assert "task 3, step 0: made again, same id" in capsys.readouterr().out
+    assert "task 3, step 0: regenerated, same id" in capsys.readouterr().out
     littered(folder)
     assert run(data, ["gc", str(folder), "--dry-run", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["bytes"] == 13
