@@ -61,8 +61,8 @@ def envs(as_json: bool, quiet: bool) -> None:
         return
     heads = {
         "name": "environment",
-        "observation_dim": "observation",
-        "action_dim": "action",
+        "observation_dim": "obs dim",
+        "action_dim": "act dim",
         "horizon": "horizon",
         "tasks": "tasks",
         "train": "train",
