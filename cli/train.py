@@ -183,6 +183,7 @@ def _train(
 ) -> "TrainingReport":
     from tcmrl_algo import train_run
 
+    _note_source(dataset, config, profile, progress)
     return train_run(
         dataset,
         folder,
@@ -195,6 +196,20 @@ def _train(
         report=lambda event: _show(progress, event),
         say=progress.note,
     )
+
+
+def _note_source(
+    dataset: "Dataset", config: "TrainingConfig", profile: Profile, progress: StageProgress
+) -> None:
+    """Says where the method's own settings come from, if it has any and the dataset does not hold them."""
+    table = f"[training.{config.settings.run.algorithm}]"
+    if config.method and config.training_source == "recipe":
+        source = f"the installed recipe's, profile {profile!r}"
+    elif config.method and config.training_source == "defaults":
+        source = "the method's defaults"
+    else:
+        return
+    progress.note(f"{dataset.folder} holds no {table} table; its values are {source}")
 
 
 def _resume(
@@ -238,7 +253,8 @@ def _check_settings(folder: Path, config: "TrainingConfig", overrides: Sequence[
 
     tables = config.settings.model_dump() | {config.settings.run.algorithm: config.method}
     for text in overrides:
-        if resolve(tables, place=f"--set {text}", overrides=[text]) != config:
+        found = resolve(tables, place=f"--set {text}", overrides=[text])
+        if (found.settings, found.method) != (config.settings, config.method):
             raise click.UsageError(
                 f"{folder} was not trained with --set {text}; omit it, or train a new run in another --out."
             )

@@ -19,6 +19,7 @@ import tcmrl_data
 from tcmrl_algo import experiment_names, load_experiment, open_run, run_experiment, train_run
 from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.driver import Finished
+from tcmrl_algo.experiment.job import Job, run_job
 from tcmrl_algo.experiment.plan import plan_runs, resolve_method
 from tcmrl_algo.experiment.results import RunResult, read_results
 from tcmrl_data import SelectionError, TcmrlError, TrainingError
@@ -341,3 +342,30 @@ def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
 def test_a_missing_experiment_attribute_is_named() -> None:
     with pytest.raises(TrainingError, match="title"):
         read_experiment({"schema": 1, "name": "x"}, place="here")
+
+
+def test_points_of_a_curve_name_the_stage_they_lie_in(tiny_folder: Path, tmp_path: Path) -> None:
+    method = {"algorithm": "double_stages", "training": {"double_stages": {"model_steps": 20}}}
+    experiment = _small(tiny_folder, methods={"staged": method}, seeds=[0], claims=[])
+    (run,) = plan_runs(experiment, data=tiny_folder)
+    about = {name: getattr(run, name) for name in ("method", "environment", "seed", "profile", "root")}
+    job = Job(
+        **about,
+        experiment="small",
+        dataset=str(tiny_folder),
+        folder=str(tmp_path / "run"),
+        identity=run.identity(),
+        config=run.config,
+        device="cpu",
+        protocols=run.protocols,
+        curve_points=run.curve_points,
+    )
+    run_job(job, lambda event: None)
+    result = read_record(RunResult, tmp_path / "run.json")
+    assert [(point.step, point.stage) for point in result.curve] == [(20, "model"), (40, "policy")]
+
+
+def test_an_experiment_without_protocols_evaluates_by_the_papers_three(tiny_folder: Path) -> None:
+    content = experiments.tables(tiny_folder)
+    del content["protocols"]
+    assert read_experiment(content, place="test").protocols == ("paper", "offline", "idaq")

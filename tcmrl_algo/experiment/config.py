@@ -28,6 +28,9 @@ Metric = Literal[
 ]
 """What a claim compares; `reporting.measures` says how each comes from a run."""
 
+PAPER_PROTOCOLS = ("paper", "offline", "idaq")
+"""By which the paper adapts, in its order; what an experiment evaluates by unless it says otherwise."""
+
 
 class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -103,7 +106,7 @@ class Experiment(_Table):
     environments: dict[str, EnvironmentChoice] = Field(min_length=1)
     methods: dict[str, Method] = Field(min_length=1)
     training: dict[str, Any] = {}
-    protocols: tuple[str, ...] = Field(default=("paper",), min_length=1)
+    protocols: tuple[str, ...] = Field(default=PAPER_PROTOCOLS, min_length=1)
     curve_points: int = Field(default=5, ge=1)
     claims: tuple[Claim, ...] = ()
 
