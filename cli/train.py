@@ -25,7 +25,7 @@ from .reports import report
 from .runs import runs
 
 if TYPE_CHECKING:
-    from tcmrl_algo import Progress, TrainingConfig, TrainingReport
+    from tcmrl_algo import TrainingConfig, TrainingProgress, TrainingReport
     from tcmrl_data import Dataset
 
 
@@ -270,7 +270,7 @@ def _how_to_continue(folder: Path) -> str:
     return f"to continue from step {step:,}, run `{typed_command('--resume')}`"
 
 
-def _show(progress: StageProgress, event: "Progress") -> None:
+def _show(progress: StageProgress, event: "TrainingProgress") -> None:
     detail = f"{event.data_share:.0%} waiting for data"
     progress.update("training", done=event.step, total=event.steps, unit="steps", detail=detail)
 

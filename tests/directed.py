@@ -19,7 +19,7 @@ from tcmrl_data.engine.base import Unit
 from tcmrl_data.foundation import disk
 from tests.workers import wait_for
 
-BUILD, EXPERIMENT = "tcmrl_data.build.driver", "tcmrl_algo.experiment.driver"
+BUILD, EXPERIMENT = "tcmrl_data.build.driver", "tcmrl_algo.experiment.runner"
 """The modules that make units."""
 
 WORK = {

@@ -17,7 +17,7 @@ from tcmrl_algo.context_methods.learner import (
 )
 from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.base import MethodConfig
-from tcmrl_algo.methods.packing import pack
+from tcmrl_algo.methods.padding import pad_trajectories
 from tcmrl_algo.networks.momentum import follow, momentum_copy
 from tcmrl_algo.networks.optimizer import Adam, ParameterGroup
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Transitions, UniformController
@@ -35,7 +35,7 @@ def test_every_step_has_its_own_generator() -> None:
 
 def test_packed_trajectories_keep_their_steps_and_mask_the_rest() -> None:
     lanes = [[trajectory(6, 0)], [trajectory(4, 1), trajectory(2, 2)]]
-    packed = pack(lanes, problem())
+    packed = pad_trajectories(lanes, problem())
     assert packed.mask.sum(dim=-1).tolist() == [[6, 0], [4, 2]]
     expected = torch.from_numpy(lanes[1][1].observations[1:])
     torch.testing.assert_close(packed.next_observations[1, 1, :2], expected)
@@ -44,7 +44,7 @@ def test_packed_trajectories_keep_their_steps_and_mask_the_rest() -> None:
 
 def test_packed_trajectories_carry_what_lies_between_a_step_and_their_end() -> None:
     short = replace(trajectory(2, 0), rewards=np.array([1.0, 4.0], dtype=np.float32))
-    packed = pack([[trajectory(3, 1), short]], problem(), gamma=0.5)
+    packed = pad_trajectories([[trajectory(3, 1), short]], problem(), gamma=0.5)
     found = (packed.returns_to_go, packed.discounts_to_end, packed.times, packed.final_observations)
     returns, discounts, times, final = (value[0, 1] for value in found if value is not None)
     assert returns.tolist() == [3.0, 4.0, 0.0]

@@ -12,7 +12,7 @@ import pytest
 from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import open_run, resume_run, train_run
-from tcmrl_algo.training.train import Progress
+from tcmrl_algo.training.train import TrainingProgress
 from tcmrl_data import Dataset
 from tests.commands import Call, assert_refused, in_process
 from tests.test_train import SMALL, config_of
@@ -34,8 +34,8 @@ def as_in_a_program() -> Any:
     signal.signal(signal.SIGINT, earlier)
 
 
-def interrupt_at(step: int) -> Callable[[Progress], None]:
-    def report(progress: Progress) -> None:
+def interrupt_at(step: int) -> Callable[[TrainingProgress], None]:
+    def report(progress: TrainingProgress) -> None:
         if progress.step == step:
             signal.raise_signal(signal.SIGINT)
 
@@ -60,7 +60,7 @@ def test_an_interrupted_run_saves_its_step_and_ends_in_the_same_tensors(
 def test_a_run_killed_before_its_first_checkpoint_says_that_it_begins_anew(
     tiny: Dataset, tmp_path: Path
 ) -> None:
-    def kill(progress: Progress) -> None:
+    def kill(progress: TrainingProgress) -> None:
         raise RuntimeError("killed")
 
     with pytest.raises(RuntimeError, match="killed"):

@@ -15,7 +15,7 @@ import torch
 from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
-from tcmrl_algo import Report, open_run, run_experiment, write_report
+from tcmrl_algo import WrittenReport, open_run, run_experiment, write_report
 from tcmrl_algo.experiment.config import Claim, read_experiment
 from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.reporting.claims import Verdict, judge, measure_result
@@ -47,7 +47,7 @@ def results(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path
 
 
 @pytest.fixture(scope="module")
-def report(results: Path, tmp_path_factory: pytest.TempPathFactory) -> Report:
+def report(results: Path, tmp_path_factory: pytest.TempPathFactory) -> WrittenReport:
     return write_report([results], tmp_path_factory.mktemp("report"))
 
 
@@ -214,7 +214,7 @@ def test_the_paper_stands_beside_ours_where_the_unit_is_the_same(trained: Finish
     assert set(published()["returns"]) <= known
 
 
-def test_a_report_holds_every_section_and_every_file_it_names(report: Report, results: Path) -> None:
+def test_a_report_holds_every_section_and_every_file_it_names(report: WrittenReport, results: Path) -> None:
     text = report.report.read_text()
     for heading in ("Claims", "Learning curves", "Time and memory", "Contexts", "Attention"):
         assert f"# {heading}" in text
@@ -235,7 +235,7 @@ def test_a_report_holds_every_section_and_every_file_it_names(report: Report, re
     assert [each.verdict for each in report.verdicts] == ["cannot tell"] * 2
 
 
-def test_dataset_returns_are_those_of_its_parts(report: Report, tiny: Dataset) -> None:
+def test_dataset_returns_are_those_of_its_parts(report: WrittenReport, tiny: Dataset) -> None:
     (file,) = (each for each in report.files if each.name.endswith("-dataset.csv"))
     rows = {row["snapshot"]: row for row in csv.DictReader(file.read_text().splitlines())}
     means = [tiny.part(task.index, 150).statistics.mean for task in tiny.train_tasks]

@@ -23,7 +23,7 @@ from tcmrl_algo.settings.brac import BracSettings
 from tcmrl_algo.settings.optimizer import OptimizerSettings
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_algo.training.train import Progress
+from tcmrl_algo.training.train import TrainingProgress
 from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
 from tests.commands import Call, assert_refused, in_process
 
@@ -145,7 +145,7 @@ def test_a_run_killed_between_checkpoints_resumes_from_the_last(
     class Killed(Exception):
         pass
 
-    def kill(progress: Progress) -> None:
+    def kill(progress: TrainingProgress) -> None:
         if progress.step >= 40:
             raise Killed
 
@@ -295,7 +295,7 @@ def test_contexts_may_come_from_other_snapshots_than_transitions(start: Train, t
 
 
 def test_progress_is_reported_with_rates(start: Train) -> None:
-    seen: list[Progress] = []
+    seen: list[TrainingProgress] = []
     start("run", steps=25, report=seen.append)
     assert [(each.step, each.steps) for each in seen] == [(10, 25), (20, 25), (25, 25)]
     assert all(each.rate > 0 and 0 <= each.data_share <= 1 for each in seen)

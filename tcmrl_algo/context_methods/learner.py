@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from tcmrl_algo.actor_critic.actor_critic import ActorCritic
 from tcmrl_algo.methods.base import Algorithm, Metrics
-from tcmrl_algo.methods.packing import pack
+from tcmrl_algo.methods.padding import pad_trajectories
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.methods.stages import StagedOptimizer
 from tcmrl_algo.methods.state import TrainedModules
@@ -157,7 +157,7 @@ class ContextAlgorithm(Algorithm):
 
     def pack(self, trajectories: Sequence[Sequence[Trajectory]]) -> Steps:
         """The trajectories of every lane as the learner reads them, on its device."""
-        return pack(trajectories, self._problem)
+        return pad_trajectories(trajectories, self._problem)
 
     def tensors(self) -> dict[str, Tensor]:
         return self._trained.tensors()

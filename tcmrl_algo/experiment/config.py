@@ -50,7 +50,7 @@ class EnvironmentChoice(_Table):
     training: dict[str, Any] = {}
 
 
-class Method(_Table):
+class MethodChoice(_Table):
     """One `[methods.LABEL]` table.
 
     Attributes:
@@ -104,7 +104,7 @@ class Experiment(_Table):
     source: str
     seeds: tuple[int, ...] = Field(min_length=1)
     environments: dict[str, EnvironmentChoice] = Field(min_length=1)
-    methods: dict[str, Method] = Field(min_length=1)
+    methods: dict[str, MethodChoice] = Field(min_length=1)
     training: dict[str, Any] = {}
     protocols: tuple[str, ...] = Field(default=PAPER_PROTOCOLS, min_length=1)
     curve_points: int = Field(default=5, ge=1)

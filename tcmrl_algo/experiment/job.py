@@ -15,9 +15,9 @@ from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.adaptation.evaluate import Evaluation, evaluate_run
 from tcmrl_algo.experiment.results import CurvePoint, RunResult, result_file
-from tcmrl_algo.training.checkpoint import digest, open_run
+from tcmrl_algo.training.checkpoint import open_run, tensors_digest
 from tcmrl_algo.training.config import TrainingConfig, stage_plan
-from tcmrl_algo.training.train import Progress, resume_run, train_run
+from tcmrl_algo.training.train import TrainingProgress, resume_run, train_run
 from tcmrl_data import CheckpointError, Dataset, open_dataset
 from tcmrl_data.engine.worker import Send, serve
 from tcmrl_data.foundation.records import read_record, write_record
@@ -114,7 +114,7 @@ def _train_to(step: int, job: Job, dataset: Dataset, report: Send) -> tuple[int,
     if start == step:
         return 0, 0.0
 
-    def show(progress: Progress) -> None:
+    def show(progress: TrainingProgress) -> None:
         nonlocal reported
         report({"kind": "steps", "count": progress.step - reported})
         reported = progress.step
@@ -150,7 +150,7 @@ def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: Mapping[str, E
         identity=job.identity,
         config=run.record.config,
         versions=run.record.versions | {"tcmrl": importlib.metadata.version("tcmrl")},
-        digest=digest(run.newest().tensors()),
+        digest=tensors_digest(run.newest().tensors()),
         curve=curve,
         evaluations={name: each.to_json() for name, each in evaluations.items()},
         training_seconds=seconds * steps / timed if timed else None,

@@ -10,7 +10,7 @@ import numpy as np
 from tcmrl_algo.experiment.results import RunResult, by_method
 from tcmrl_algo.reporting.claims import Verdict
 from tcmrl_algo.reporting.contexts import TransitionWeights
-from tcmrl_algo.reporting.tables import Cell, Table, across_seeds, spread
+from tcmrl_algo.reporting.tables import Cell, Table, across_seeds, interval_text
 from tcmrl_data import Dataset, return_table
 
 PAPER_COSTS = ("paper: training s", "paper: MB")
@@ -44,7 +44,7 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     """Each claim, the mean difference with its interval or seeds, and the verdict."""
     rows: list[tuple[Cell, ...]] = []
     for each in verdicts:
-        interval = spread(each.differences, each.low, each.high) if each.seeds else None
+        interval = interval_text(each.differences, each.low, each.high) if each.seeds else None
         numbers = (len(each.seeds), each.mean, interval)
         rows.append((each.claim, each.environment, each.comparison, *numbers, each.verdict))
     columns = ("claim", "environment", "compared", "seeds", "mean difference", "95% interval", "verdict")

@@ -9,7 +9,7 @@ from tcmrl_algo.adaptation.evaluate import evaluate_run
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.experiment.config import Experiment, read_experiment, run_id
 from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file
-from tcmrl_algo.training.checkpoint import Run, digest, open_run
+from tcmrl_algo.training.checkpoint import Run, open_run, tensors_digest
 from tcmrl_data import CheckpointError, TrainingError, canonical_json, open_dataset, parse_json
 
 
@@ -198,7 +198,7 @@ def _evaluated(label: str, run: Run, place: str | None) -> RunResult:
         identity={},
         config=record.config,
         versions=record.versions,
-        digest=digest(run.newest().tensors()),
+        digest=tensors_digest(run.newest().tensors()),
         curve=(),
         evaluations=documents,
         training_seconds=None,

@@ -39,10 +39,10 @@ def across_seeds(values: Sequence[float | None]) -> tuple[Cell, Cell, Cell]:
     if not known or len(known) < len(values):
         return None, None, None
     summary = summarize(known)
-    return summary.mean, summary.iqm, spread(summary.values, summary.low, summary.high)
+    return summary.mean, summary.iqm, interval_text(summary.values, summary.low, summary.high)
 
 
-def spread(values: Sequence[float], low: float | None, high: float | None) -> str:
+def interval_text(values: Sequence[float], low: float | None, high: float | None) -> str:
     """The 95% interval, or the seeds."""
     if low is None or high is None:
         return "seeds: " + ", ".join(f"{each:.4g}" for each in values)

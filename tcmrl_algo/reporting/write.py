@@ -17,7 +17,7 @@ from tcmrl_algo.reporting.tables import Table
 from tcmrl_data import TcmrlError
 from tcmrl_data.foundation.disk import replace_file
 
-Progress = Callable[[str, int, int], None]
+ReportProgress = Callable[[str, int, int], None]
 
 NOTE = """\
 Returns are undiscounted sums of rewards after adaptation to the test tasks, means over them. An interval is \
@@ -47,7 +47,7 @@ the rows."""
 
 
 @dataclass(frozen=True)
-class Report:
+class WrittenReport:
     """What was written.
 
     Attributes:
@@ -101,8 +101,8 @@ def write_report(
     out: str | Path,
     *,
     datasets: Sequence[str | Path] = (),
-    report: Progress = ignore,
-) -> Report:
+    report: ReportProgress = ignore,
+) -> WrittenReport:
     """Writes a report on results folders of experiments, and on run folders.
 
     Args:
@@ -137,11 +137,11 @@ def write_report(
         head.table(sections.claims_table("claims", judged))
     file = page.out / "report.md"
     replace_file(file, ("\n\n".join([*head.lines, *page.lines]) + "\n").encode())
-    return Report(file, (file, *head.files, *page.files), verdicts)
+    return WrittenReport(file, (file, *head.files, *page.files), verdicts)
 
 
 def _write_source(
-    page: Page, source: Source, name: str, trained: Trained, report: Progress, *, alone: bool
+    page: Page, source: Source, name: str, trained: Trained, report: ReportProgress, *, alone: bool
 ) -> list[Verdict]:
     experiment = source.experiment
     page.text(f"## {experiment.title}")

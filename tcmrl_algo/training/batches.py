@@ -14,13 +14,9 @@ from tcmrl_data import (
     Dataset,
     Moments,
     Sampler,
-    Trajectories,
     Transitions,
-    Windows,
     open_sampler,
 )
-
-Kind = Transitions | Trajectories | Windows
 
 
 @runtime_checkable
@@ -83,11 +79,9 @@ def open_batches(
 
 def split_request(request: BatchRequest) -> tuple[BatchRequest, BatchRequest]:
     """The request's transitions, and its trajectories and windows; no draw depends on the other half."""
-    halves: tuple[dict[str, Kind], dict[str, Kind]] = ({}, {})
-    for name, kind in request.kinds.items():
-        halves[not isinstance(kind, Transitions)][name] = kind
-    transitions, contexts = (replace(request, kinds=half) for half in halves)
-    return transitions, contexts
+    single = {name: kind for name, kind in request.kinds.items() if isinstance(kind, Transitions)}
+    longer = {name: kind for name, kind in request.kinds.items() if name not in single}
+    return replace(request, kinds=single), replace(request, kinds=longer)
 
 
 @final

@@ -195,7 +195,7 @@ def write_run(folder: Path, record: RunRecord) -> Run:
     return Run(folder, record)
 
 
-def digest(tensors: Mapping[str, Tensor]) -> str:
+def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
     """sha256 over names, types and bytes of tensors, sorted by name."""
     total = hashlib.sha256()
     for name in sorted(tensors):

@@ -15,7 +15,7 @@ from tcmrl_algo.methods.base import Algorithm
 from tcmrl_algo.methods.privileged import TaskParameters
 from tcmrl_algo.methods.problem import MomentsRecord, problem_of
 from tcmrl_algo.training.batches import StagedBatches, open_batches
-from tcmrl_algo.training.checkpoint import Run, RunRecord, digest, open_run, write_run
+from tcmrl_algo.training.checkpoint import Run, RunRecord, open_run, tensors_digest, write_run
 from tcmrl_algo.training.config import TrainingConfig, method_of, stage_plan
 from tcmrl_algo.training.interruption import DeferredInterrupts
 from tcmrl_algo.training.memory import keep_freed_memory
@@ -35,7 +35,7 @@ PREFETCHED = 2
 
 
 @dataclass(frozen=True)
-class Progress:
+class TrainingProgress:
     """Where a training run stands.
 
     Attributes:
@@ -72,7 +72,7 @@ class TrainingReport:
     digest: str
 
 
-def ignore(progress: Progress) -> None:
+def ignore(progress: TrainingProgress) -> None:
     """Reports nothing."""
 
 
@@ -90,7 +90,7 @@ def train_run(
     steps: int | None = None,
     device: str = "cpu",
     memory_limit: int | None = None,
-    report: Callable[[Progress], None] = ignore,
+    report: Callable[[TrainingProgress], None] = ignore,
     say: Callable[[str], None] = keep_quiet,
 ) -> TrainingReport:
     """Trains a new run.
@@ -155,7 +155,7 @@ def resume_run(
     steps: int | None = None,
     device: str | None = None,
     memory_limit: int | None = None,
-    report: Callable[[Progress], None] = ignore,
+    report: Callable[[TrainingProgress], None] = ignore,
     say: Callable[[str], None] = keep_quiet,
 ) -> TrainingReport:
     """Goes on from a run's newest checkpoint; ends as an uninterrupted run of the same length would have.
@@ -242,7 +242,7 @@ def _train(
     batches: StagedBatches,
     *,
     start: int,
-    report: Callable[[Progress], None],
+    report: Callable[[TrainingProgress], None],
 ) -> TrainingReport:
     """The loop: batch n - 1 makes step n; Ctrl-C and SIGTERM take effect after a checkpoint of their step."""
     settings, last = run.record.config.settings.run, run.record.steps
@@ -268,14 +268,14 @@ def _train(
                 times = {"time/steps_per_second": rate, "time/data_share": share}
                 stage = stages.at(step).stage
                 writer.write(step, values | about | times, stage=stage)
-                report(Progress(step, last, stage, rate, share, values))
+                report(TrainingProgress(step, last, stage, rate, share, values))
             stopping = interrupts.received
             if step % settings.checkpoint_every == 0 or step == last or stopping:
                 _check_finite(algorithm.tensors(), step)
                 run.save(step, algorithm.tensors())
             if stopping:
                 break  # the signal takes effect as the block ends
-    return TrainingReport(run, last, time.perf_counter() - began, digest(algorithm.tensors()))
+    return TrainingReport(run, last, time.perf_counter() - began, tensors_digest(algorithm.tensors()))
 
 
 def _check_sizes(metrics: Mapping[str, Tensor], limits: Mapping[str, float], step: int) -> None:

@@ -20,13 +20,13 @@ if TYPE_CHECKING:
 REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-class Episodes(Protocol):
+class EpisodeCounter(Protocol):
     """Counts the training episodes; reset n has its own keyed seed."""
 
     episode: int
 
 
-def capture(model: "SAC", episodes: Episodes) -> TrainingState:
+def capture(model: "SAC", episodes: EpisodeCounter) -> TrainingState:
     """The state of a model whose running episode has no step yet."""
     import torch
 
@@ -53,7 +53,7 @@ def capture(model: "SAC", episodes: Episodes) -> TrainingState:
     return TrainingState(values, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
 
 
-def restore(model: "SAC", episodes: Episodes, checkpoint: TrainingState) -> int:
+def restore(model: "SAC", episodes: EpisodeCounter, checkpoint: TrainingState) -> int:
     """Puts a freshly made model into the checkpoint's state; returns its environment steps."""
     import torch
 

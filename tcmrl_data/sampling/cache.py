@@ -32,7 +32,7 @@ from tcmrl_data.sampling.cache_entry import (
     RECORD,
     is_current,
     open_entry,
-    read_record,
+    read_entry,
     selected,
     write_entry,
 )
@@ -132,7 +132,7 @@ def list_cache() -> tuple[CacheEntry, ...]:
     found = []
     for entry in _entries(cache_folder()):
         with contextlib.suppress(FileNotFoundError), (entry / RECORD).open("rb") as file:
-            record = read_record(file)
+            record = read_entry(file)
             used, size = (
                 os.fstat(file.fileno()).st_mtime,
                 sum(each.stat().st_size for each in entry.iterdir()),

@@ -90,7 +90,7 @@ def open_entry(entry: Path, selection: "Selection") -> PackedRows | None:
     with contextlib.ExitStack() as stack:
         stack.enter_context(file)
         fcntl.flock(file, fcntl.LOCK_SH)  # an eviction holds it for a moment only
-        record = read_record(file)
+        record = read_entry(file)
         if not is_current(file, entry / RECORD) or record is None:
             return None
         episodes = _read_episodes(entry / EPISODES, record, len(selection.tasks))
@@ -117,7 +117,7 @@ def selected(selection: "Selection") -> tuple[tuple[int, tuple[int, ...]], ...]:
     return tuple((task.index, selection.steps[task.index]) for task in selection.tasks)
 
 
-def read_record(file: IO[bytes]) -> EntryRecord | None:
+def read_entry(file: IO[bytes]) -> EntryRecord | None:
     """The record, if it is whole and of this format."""
     sealed, _, data = file.read().partition(b"\n")
     if sha256(data).encode() != sealed:

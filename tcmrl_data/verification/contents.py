@@ -20,14 +20,14 @@ from tcmrl_data.store.arrays import array_digests, read_arrays, unpack
 from tcmrl_data.store.manifest import MAX_TASKS, STANDARD_ARRAYS, Manifest, PartRecord
 from tcmrl_data.store.statistics import statistics
 
-Problem = tuple[str, str]
+ContentProblem = tuple[str, str]
 """File or array within the part, and what is wrong with it."""
 
 CLOSE = 1e-9
 """Relative tolerance of recomputed sums, which another machine may add up in another order."""
 
 
-def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None) -> Iterator[Problem]:
+def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None) -> Iterator[ContentProblem]:
     """Everything that is wrong with what a part's files say.
 
     Args:
@@ -95,7 +95,7 @@ def is_close(left: Any, right: Any) -> bool:
     return bool(left == right)
 
 
-def _place(error: Exception, folder: Path, *, default: str) -> Problem:
+def _place(error: Exception, folder: Path, *, default: str) -> ContentProblem:
     """The file within a part that an error names first, and what it says of it."""
     match = re.fullmatch(r"([a-z0-9_./]+?):? (.*)", str(error).removeprefix(f"{folder}/"))
     return (match[1], match[2]) if match else (default, str(error))
@@ -111,7 +111,7 @@ def _environment(manifest: Manifest) -> Environment | str:
         return f"recipe.environment: {error}"
 
 
-def _policy_problems(folder: Path, record: PartRecord, manifest: Manifest | None) -> Iterator[Problem]:
+def _policy_problems(folder: Path, record: PartRecord, manifest: Manifest | None) -> Iterator[ContentProblem]:
     try:
         snapshot = read_snapshot(folder, record.identity.step)
     except SnapshotError as error:
@@ -128,7 +128,7 @@ def _policy_problems(folder: Path, record: PartRecord, manifest: Manifest | None
             yield "policy.json", f"observation_dim and action_dim {sizes} are not the environment's"
 
 
-def _value_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[Problem]:
+def _value_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[ContentProblem]:
     for name, array in arrays.items():
         if array.dtype.kind == "f" and not np.isfinite(array).all():
             row = int(np.flatnonzero(~np.isfinite(array).reshape(len(array), -1).all(axis=1))[0])
@@ -138,7 +138,7 @@ def _value_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[Problem]
         yield "actions", f"reach {largest:g}, outside [-1, 1]"
 
 
-def _shape_problems(arrays: Mapping[str, npt.NDArray[Any]], manifest: Manifest) -> Iterator[Problem]:
+def _shape_problems(arrays: Mapping[str, npt.NDArray[Any]], manifest: Manifest) -> Iterator[ContentProblem]:
     episodes = len(arrays["episode_offsets"]) - 1
     if episodes != manifest.recipe.rollouts.episodes:
         yield "episode_offsets", f"{episodes} episodes, not the recipe's {manifest.recipe.rollouts.episodes}"
@@ -158,7 +158,7 @@ def _shape_problems(arrays: Mapping[str, npt.NDArray[Any]], manifest: Manifest) 
         yield "episode_offsets", f"an episode of {longest} steps, horizon {environment.settings.horizon}"
 
 
-def _flag_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[Problem]:
+def _flag_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[ContentProblem]:
     """Episodes end where a flag is set and only there.
 
     Both flags may stand at one step: a task may end on the very step of its time limit.

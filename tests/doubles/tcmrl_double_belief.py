@@ -15,7 +15,7 @@ from tcmrl_algo import (
     NetworkAlgorithm,
     Problem,
     TrainingSettings,
-    pack,
+    pad_trajectories,
 )
 from tcmrl_algo.networks.perceptron import linear
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectories, Trajectory, Transition
@@ -60,7 +60,7 @@ class BeliefLearner(NetworkAlgorithm):
         self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
     ) -> Controller:
         with torch.no_grad():
-            return BeliefController(self, self.beliefs(pack(trajectories, self.problem))[-1])
+            return BeliefController(self, self.beliefs(pad_trajectories(trajectories, self.problem))[-1])
 
 
 class BeliefController(FunctionController):

@@ -14,7 +14,7 @@ from tcmrl_algo import (
     NetworkAlgorithm,
     Problem,
     TrainingSettings,
-    pack,
+    pad_trajectories,
 )
 from tcmrl_algo.networks.perceptron import linear
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectory, Transitions
@@ -68,7 +68,7 @@ class GradientLearner(NetworkAlgorithm):
         self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
     ) -> Controller:
         with torch.enable_grad():
-            adapted = self.adapted(pack(trajectories, self.problem, gamma=self.config.gamma))
+            adapted = self.adapted(pad_trajectories(trajectories, self.problem, gamma=self.config.gamma))
         weights, biases = (value.detach() for value in adapted)
         return FunctionController(
             lambda states: self.act(states.unsqueeze(1), weights, biases).squeeze(1), self.problem.device

@@ -12,7 +12,7 @@ from tcmrl_algo.methods.problem import Problem
 from tcmrl_data import Steps, Trajectory
 
 
-def pack(
+def pad_trajectories(
     trajectories: Sequence[Sequence[Trajectory]], problem: Problem, *, gamma: float | None = None
 ) -> Steps:
     """Trajectories of several lanes as padded steps (lanes, most trajectories, longest episode).

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tcmrl_algo.experiment.config import Experiment, run_id
 from tcmrl_algo.experiment.job import Job
-from tcmrl_algo.experiment.plan import PlannedRun, check_same, plan_runs
+from tcmrl_algo.experiment.planning import PlannedRun, check_same, plan_runs
 from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file, table_text
 from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_algo.training.train import usable_device
@@ -22,7 +22,7 @@ WORKER = "tcmrl_algo.experiment.job"
 
 
 @dataclass(frozen=True)
-class Finished:
+class FinishedRun:
     """A run that ended in this call.
 
     Attributes:
@@ -60,7 +60,7 @@ class ExperimentReport:
     seconds: float
 
 
-def ignore(event: Finished) -> None:
+def ignore(event: FinishedRun) -> None:
     """Reports nothing."""
 
 
@@ -74,7 +74,7 @@ def run_experiment(
     steps: int | None = None,
     workers: int | None = None,
     device: str = "cpu",
-    report: Callable[[Finished], None] = ignore,
+    report: Callable[[FinishedRun], None] = ignore,
 ) -> ExperimentReport:
     """Runs an experiment, or what is missing of it; nothing starts before everything is checked.
 
@@ -132,7 +132,7 @@ def run_experiment(
             pace = (time.perf_counter() - began) / (ended - present)
             is_known = ended - present >= min(workers, len(jobs))
             left = pace * (len(plan) - ended) if is_known else None
-            report(Finished(name, result, error, ended, len(plan), left))
+            report(FinishedRun(name, result, error, ended, len(plan), left))
     results = tuple(each for each in found.values() if each is not None)
     return ExperimentReport(out, results, present, tuple(failed), time.perf_counter() - began)
 
