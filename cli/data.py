@@ -13,6 +13,7 @@ from .frame import main_program, make_table, output_options, print_json, print_t
 from .inspection import inspect
 from .plugins import FORMAT
 from .progress import StageProgress
+from .recipes import recipe
 from .show import show
 from .status import status
 from .verification import gc, import_policy, repair, verify
@@ -40,7 +41,7 @@ def data() -> None:
     """
 
 
-for _command in (plan, build, status, show, inspect, verify, repair, gc, import_policy, cache):
+for _command in (recipe, plan, build, status, show, inspect, verify, repair, gc, import_policy, cache):
     data.add_command(_command)
 
 

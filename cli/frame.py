@@ -163,7 +163,12 @@ def print_table(table: "Table") -> None:
         if column.no_wrap:
             texts = (str(column.header), *map(str, column.cells))
             column.min_width = max(len(line) for text in texts for line in text.split("\n"))
+    folded = [column for column in table.columns if column.overflow == "fold"]
+    for column in folded:
+        column.max_width = column.min_width  # rich takes a word for something that cannot be folded
     width = max(console.width, console.measure(table).minimum)
+    for column in folded:
+        column.max_width = None
     title, table.title = table.title or "", None
     with console.capture() as capture:
         console.print(title, style="bold")  # apart: a title of the table wraps at the table's width

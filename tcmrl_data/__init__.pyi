@@ -46,6 +46,7 @@ from .recipe.profile import Profile as Profile
 from .recipe.recipe import Recipe as Recipe
 from .recipe.recipe import load_recipe as load_recipe
 from .recipe.tasks import parse_indices as parse_indices
+from .recipe.values import recipe_values as recipe_values
 from .sampling.batch import Batch as Batch
 from .sampling.batch import Moments as Moments
 from .sampling.batch import Steps as Steps

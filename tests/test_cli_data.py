@@ -245,3 +245,15 @@ def test_a_dataset_whose_environment_is_not_installed_is_still_listed_and_inspec
         assert call("inspect", subject, folder)[0] == 0
     settings = tcmrl_data.open_dataset(folder).manifest.recipe.unit_settings()
     assert settings["environment"] == values["recipe"]["environment"]
+
+
+def test_recipe_prints_the_values_of_a_recipe_as_json(call: Call, tmp_path: Path) -> None:
+    text = ENVIRONMENTS.get("point-robot").recipe_file("point-robot").read_text(encoding="utf-8")
+    (tmp_path / "mine.toml").write_text(text)
+    code, output, errors = call("recipe", tmp_path / "mine.toml", "--profile", "quick", "--json")
+    document = json.loads(output)
+    assert (code, errors, list(document)) == (0, "", ["environment", "profile", "values"])
+    assert (document["environment"], document["profile"]) == ("point-robot", "quick")
+    assert {"key": "environment.horizon", "value": 20, "source": "published code"} in document["values"]
+    assert json.loads(call("recipe", "point-robot", "--profile", "quick", "--json")[1]) == document
+    assert_refused(call("recipe", "point-robot", "--set", "rollouts.lane=1"), "rollouts.lane", "lanes")

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import json
 import re
 import shutil
 from pathlib import Path
@@ -11,7 +12,7 @@ from rich.table import Table
 from tcmrl_cli.data import data
 from tcmrl_cli.frame import make_table, print_table
 
-from tcmrl_data import Dataset
+from tcmrl_data import Dataset, recipe_values
 from tests.commands import Call, in_process
 from tests.terminal import assert_fits, in_terminal
 
@@ -47,6 +48,8 @@ def test_the_list_of_datasets_fits_a_terminal_with_root_and_state_whole(shelf: P
     "command",
     [
         ("envs",),
+        ("recipe", "point-robot", "--profile", "quick"),
+        ("recipe", "walker-rand-params"),
         ("plan", "half-cheetah-vel", "--profile", "quick"),
         ("inspect", "returns", "DATASET"),
         ("inspect", "tasks", "DATASET"),
@@ -69,7 +72,7 @@ def test_every_table_fits_a_terminal_and_says_what_it_says_in_a_pipe(
         assert_fits(shown.output)
     piped = call(*arguments)[1]
     assert all(line == line.rstrip() for line in piped.splitlines())
-    if command[0] in ("envs", "inspect"):
+    if command[0] in ("envs", "recipe", "inspect"):
         assert sorted(numbers(shown.output)) == sorted(numbers(piped))
 
 
@@ -87,3 +90,26 @@ def render(table: Table) -> str:
     with contextlib.redirect_stdout(io.StringIO()) as stream:
         print_table(table)
     return stream.getvalue()
+
+
+def test_keys_values_and_sources_of_a_recipe_are_whole_in_a_terminal() -> None:
+    shown = in_terminal("tcmrl-data", "recipe", "ml1/box-close", "--set", "rollouts.lanes=25")
+    assert shown.code == 0
+    assert_fits(shown.output)
+    lines = shown.output.splitlines()
+    head = next(line for line in lines if line.split() == ["key", "value", "source"])
+    value, source = head.index("value"), head.index("source")
+    rows: list[list[str]] = []
+    for line in lines[lines.index(head) + 2 :]:
+        cells = [cell.strip() for cell in (line[:value], line[value:source], line[source:])]
+        if cells[0]:
+            rows.append(cells)
+        else:
+            rows[-1] = [" ".join(filter(None, pair)) for pair in zip(rows[-1], cells, strict=True)]
+    expected = recipe_values("ml1/box-close", overrides=["rollouts.lanes=25"]).values
+    assert [row[0] for row in rows] == [one.key for one in expected]
+    found = {row[0]: row[1:] for row in rows}
+    for one in expected:
+        assert found[one.key][1] == one.source
+        if isinstance(one.value, list | float | int):
+            assert json.loads(found[one.key][0]) == one.value

@@ -41,6 +41,7 @@ def loaded_after(code: str, *arguments: str) -> set[str]:
         ["--help"],
         ["build", "--help"],
         ["envs"],
+        ["recipe", "point-robot", "--profile", "quick"],
         ["list", "PARENT"],
         ["inspect", "returns", "DATASET"],
         ["inspect", "returns", "DATASET", "--recompute"],

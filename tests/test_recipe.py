@@ -1,3 +1,4 @@
+import json
 from itertools import pairwise
 from pathlib import Path
 
@@ -6,8 +7,10 @@ import pytest
 from tcmrl_data import Recipe, apply_overrides, canonical_json, list_environments, load_recipe
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
-from tcmrl_data.recipe.profile import PROFILES
+from tcmrl_data.recipe.comments import read_comments
+from tcmrl_data.recipe.profile import PROFILES, Profile
 from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.recipe.values import recipe_values
 from tests.environments import some_members
 
 
@@ -186,3 +189,75 @@ def test_a_recipe_is_the_same_after_json() -> None:
         assert recipe.unit_settings()["environment"] == recipe.make_environment().settings.model_dump(
             mode="json"
         )
+
+
+COMMENTED = '''
+[plain]  # of the header
+# of the table
+one = 1
+two = 2            # behind # twice
+text = "# no comment"
+# above,
+# in two lines
+three.four = [     # inside
+    1,             # of an item
+    2
+]                  # behind a list
+
+five = """
+# text
+"""
+
+# of nothing
+
+[other."a.b"]
+six = { seven = 7, eight = 8 }
+'''
+
+
+def test_a_comment_belongs_to_the_value_before_it_below_it_or_to_its_table() -> None:
+    assert read_comments(COMMENTED) == {
+        ("plain", "one"): "of the table",
+        ("plain", "two"): "behind # twice",
+        ("plain", "text"): "of the table",
+        ("plain", "three", "four"): "behind a list",
+        ("plain", "five"): "of the table",
+        ("other", "a.b", "six", "seven"): "",
+        ("other", "a.b", "six", "eight"): "",
+    }
+    assert read_comments("# above,\n# in two lines\none = 1\n\n# far\n\ntwo = 2") == {
+        ("one",): "above, in two lines",
+        ("two",): "",
+    }
+
+
+@pytest.mark.parametrize("name", ["sparse-point-robot", "ml1/box-close", "hopper-rand-params"])
+@pytest.mark.parametrize("profile", ["paper", "quick"])
+def test_every_value_of_a_recipe_is_listed_and_can_be_set_by_its_key(name: str, profile: Profile) -> None:
+    listed = recipe_values(name, profile=profile).values
+    assert len({value.key for value in listed}) == len(listed)
+    overrides = [f"{value.key}={json.dumps(value.value)}" for value in listed if value.value is not None]
+    recipe = load_recipe(name, profile=profile)
+    assert load_recipe(name, profile=profile, overrides=overrides) == recipe
+    with pytest.raises(RecipeError, match="unknown key"):
+        load_recipe(name, profile=profile, overrides=["behavior.sac.no_such_key=1"])
+    keys = {value.key for value in listed}
+    assert {f"environment.{key}" for key in recipe.environment.model_dump() if key != "name"} <= keys
+    assert {f"build.{key}" for key in recipe.build.model_dump()} <= keys
+    settings = {
+        key.rpartition(".")[2] for key in keys if key.startswith(("behavior.sac.", "behavior.stacked."))
+    }
+    assert settings == set(recipe.behavior.settings)
+
+
+def test_a_source_is_that_of_the_layer_that_the_value_comes_from() -> None:
+    found = recipe_values("ml1/box-close", profile="quick", overrides=["rollouts.lanes=5", "training.a.b=1"])
+    sources = {value.key: (value.value, value.source) for value in found.values}
+    assert (found.environment, found.profile) == ("ml1/box-close", "quick")
+    assert sources["rollouts.lanes"] == (5, "--set")
+    assert sources["training.a.b"] == (1, "--set")
+    assert sources["rollouts.episodes"] == (10, "profile quick")
+    assert sources["behavior.sac.tau"][1].startswith("Values without a comment are from the SAC paper")
+    assert sources["training.batch.window_length"] == (8, "variant ml1/box-close: K; paper, F.2")
+    assert sources["behavior.stacked.group"][1].startswith("profile quick: the profile's tasks")
+    assert sources["build.timeout"] == (None, "default")
