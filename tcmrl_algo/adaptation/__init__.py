@@ -1,1 +1,1 @@
-"""Meta-testing: adaptation to test tasks by a protocol."""
+"""Meta-testing: protocols that adapt a trained policy to test tasks, and its evaluation."""

@@ -1,4 +1,4 @@
-"""Where protocols adapt: episodes of test tasks, and stored trajectories."""
+"""What protocols use to adapt: episodes of test tasks, and stored trajectories."""
 
 from collections.abc import Callable, Sequence
 from typing import final
@@ -20,30 +20,30 @@ from tcmrl_data import (
 )
 
 MOST_LANES = 50
-"""Episodes stepped together; as many Meta-World lanes take 1 GB and 8 s to make."""
+"""Most episodes that are stepped together; this many Meta-World lanes take 1 GB and 8 s to create."""
 
 Context = Sequence[Trajectory]
-"""Trajectories that a policy is adapted by; none stands for the prior of a method that has one."""
+"""Trajectories that a policy adapts to; an empty context is the prior of a method that has one."""
 
 ProgressCallback = Callable[[str, int, int], None]
-"""Called with a stage, episodes done and episodes to do."""
+"""Called with the name of a stage, the episodes done, and their total number."""
 
 
 def ignore_progress(stage: str, done: int, total: int) -> None:
-    """ProgressCallbacks nothing."""
+    """Ignores progress."""
 
 
 @final
 class Arena:
-    """Runs episodes of test tasks, all stepped together, each with its own keyed seeds.
+    """Runs episodes of test tasks, stepped together; every episode has its own keyed seeds.
 
     Args:
-        dataset: names environment and tasks, and holds stored trajectories.
+        dataset: the dataset, with its environment, tasks and stored trajectories.
         algorithm: the trained method.
-        settings: `[training.run]`.
-        capabilities: of the method; tell whether it needs trajectories, and may see task parameters.
-        seed: the run's; addresses resets, noise and drawn contexts.
-        report: called with stage, episodes done and episodes to do, as episodes end.
+        settings: the table `[training.run]`.
+        capabilities: the method's; whether it needs trajectories, and may observe task parameters.
+        seed: the run's seed, from which the seeds of resets, noise and drawn contexts derive.
+        report: called with the stage, the episodes done and their total number, when episodes end.
     """
 
     def __init__(
@@ -65,33 +65,38 @@ class Arena:
         self._stored: dict[int, list[Trajectory]] = {}
 
     def begin(self, stage: str, total: int) -> None:
-        """Names what the coming episodes are for, and their number, for progress reports."""
+        """Starts a stage of progress reports.
+
+        Args:
+            stage: name of the stage.
+            total: number of its episodes.
+        """
         self._stage, self._done, self._total = stage, 0, total
 
     def adapted(
         self, tasks: Sequence[Task], contexts: Sequence[Context], *, episode: int
     ) -> list[Trajectory]:
-        """One episode per lane by the policy adapted to that lane's context; lanes may repeat tasks.
+        """One episode per lane, by the policy adapted to the lane's context; lanes may repeat tasks.
 
         Raises:
-            TrainingError: a context without trajectories, for a method that needs some.
+            TrainingError: an empty context, for a method that needs trajectories.
         """
         self._check_contexts(tasks, contexts)
-        found: list[Trajectory] = []
+        trajectories: list[Trajectory] = []
         for start in range(0, len(tasks), MOST_LANES):
             lanes = slice(start, start + MOST_LANES)
             controller = self._adapt(tasks[lanes], contexts[lanes])
-            found += self._run(tasks[lanes], controller, episode=episode, first_lane=start)
-        return found
+            trajectories += self._run(tasks[lanes], controller, episode=episode, first_lane=start)
+        return trajectories
 
     def explored(
         self, tasks: Sequence[Task], collected: Sequence[Context], *, episode: int
     ) -> list[Trajectory]:
-        """One episode per lane by the method's exploration, uniform actions unless it has its own."""
+        """One episode per lane by the exploration of the method, which is uniform actions by default."""
         return self._run(tasks, self._algorithm.explore(collected), episode=episode, first_lane=0)
 
     def stored(self, task: Task, *, draw: int) -> Context:
-        """Stored trajectories of a task, `offline_trajectories` of them, drawn without replacement."""
+        """Draws `offline_trajectories` stored trajectories of a task without replacement."""
         if task.index not in self._stored:
             snapshots = self.settings.context_snapshots or self.settings.snapshots
             selection = self.dataset.select(tasks=[task.index], snapshots=snapshots)
@@ -102,7 +107,7 @@ class Arena:
         return [stored[index] for index in random.choice(len(stored), number, replace=False)]
 
     def close(self) -> None:
-        """Frees the lanes."""
+        """Closes the lanes."""
         if self._lanes is not None:
             self._lanes[1].close()
         self._lanes = None
@@ -113,19 +118,19 @@ class Arena:
         for task, context in zip(tasks, contexts, strict=True):
             if not context:
                 raise TrainingError(
-                    f"{self.settings.algorithm} cannot adapt to task {task.index} without a trajectory, and "
-                    f"the protocol {self.settings.protocol} has none; set run.random_episodes to 1 or more, "
+                    f"{self.settings.algorithm} cannot adapt to task {task.index} without a trajectory, but "
+                    f"protocol {self.settings.protocol} gave none; set run.random_episodes to 1 or more, "
                     "or choose another --protocol"
                 )
 
     def _adapt(self, tasks: Sequence[Task], contexts: Sequence[Context]) -> Controller:
-        """The adapted policy; task parameters reach no method without the capability to see them."""
+        """The adapted policy; only a privileged method gets the task parameters."""
         if self._parameters is None:
             return self._algorithm.adapt(contexts)
         return self._algorithm.adapt(contexts, privileged=self._parameters(tasks))
 
     def _lanes_of(self, tasks: Sequence[Task]) -> Lanes:
-        """Lanes of these tasks; the last ones are kept, since adaptation steps the same tasks again."""
+        """Lanes of the tasks; the last lanes are kept, because adaptation repeats the same tasks."""
         key = tuple(task.index for task in tasks)
         if self._lanes is None or self._lanes[0] != key:
             self.close()

@@ -1,4 +1,4 @@
-"""Meta-testing: adapts a trained run to the test tasks and scores it against its controls."""
+"""Meta-testing: adapts a trained run to the test tasks, and compares its returns with controls."""
 
 import dataclasses
 from collections.abc import Iterable, Sequence
@@ -20,28 +20,28 @@ from tcmrl_algo.training.train import create_algorithm
 from tcmrl_data import Dataset, Task, TrainingError, Trajectory
 
 MOST_OTHERS = 3
-"""Other tasks whose contexts are tried on a task; one alone could lie too near or far."""
+"""Most other tasks whose contexts are tried on a task; a single one may be very similar or dissimilar."""
 
 
 @dataclass(frozen=True)
 class TaskResult:
-    """How a run does on one test task; returns are undiscounted sums of rewards.
+    """Result of a run on one test task; returns are undiscounted sums of rewards.
 
     Attributes:
-        task: its index.
+        task: index of the task.
         split: `test`.
-        returns: one per adaptation episode.
+        returns: returns of the adaptation episodes.
         final: mean return of the adapted policy.
-        oracle: return of a controller that knows the task, or None.
+        oracle: return of a controller that knows the task, None if the environment has none.
         random: return of uniform actions.
-        regret: oracle - final, or None.
-        normalized: (final - random) / (best - random), best being the return of the reference.
-        reference: what `normalized` is 1 at: the `oracle` or, without one, the best `behavior` policy.
-        success: share of final episodes that succeed, or None where the environment does not say.
-        shuffled: mean return of the same policy under other tasks' contexts. A policy that adapts within
-            an episode begins with the other task's belief and goes on from it by what it observes, so that
-            this tells how well it corrects a wrong belief. A privileged policy keeps the parameters of the
-            task itself.
+        regret: oracle - final, None without an oracle.
+        normalized: (final - random) / (best - random), with `best` the return of the reference.
+        reference: where `normalized` is 1: the `oracle` or, without one, the best `behavior` policy.
+        success: share of successful final episodes, None if the environment does not define success.
+        shuffled: mean return of the same policy with the contexts of other tasks. A policy that adapts
+            within an episode starts with the belief of the other task and updates it by its observations,
+            so the value measures how well it corrects a wrong belief. A privileged policy keeps the
+            parameters of the task itself.
     """
 
     task: int
@@ -59,9 +59,9 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How a run does on all test tasks; means are over them, None where a task has no value.
+    """Result of a run on all test tasks; means are over tasks, and None if a task has no value.
 
-    `privileged` marks a control that saw the tasks' parameters.
+    `privileged` marks a control that observes the task parameters.
     """
 
     algorithm: str
@@ -76,7 +76,7 @@ class Evaluation:
     privileged: bool
 
     def to_json(self) -> dict[str, Any]:
-        """The document of `tcmrl evaluate --json`."""
+        """The JSON document of `tcmrl evaluate --json`."""
         return dataclasses.asdict(self)
 
 
@@ -88,19 +88,19 @@ def evaluate_run(
     episodes: int | None = None,
     report: ProgressCallback = ignore_progress,
 ) -> Evaluation:
-    """Evaluates the newest checkpoint of a run, and logs the means in the run's folder.
+    """Evaluates the newest checkpoint of a run, and logs the means in the folder of the run.
 
     Args:
-        run_folder: made by `train`.
-        protocol: instead of the run's own.
-        dataset_path: where the run's dataset lies now, if it has moved.
-        episodes: adaptation episodes per task, instead of the run's own.
-        report: called as episodes end.
+        run_folder: folder of a run of `tcmrl train`.
+        protocol: replaces the protocol of the run.
+        dataset_path: folder of the run's dataset, if the dataset was moved.
+        episodes: replaces the number of adaptation episodes per task of the run.
+        report: called when episodes end.
 
     Raises:
-        CheckpointError: no run, no checkpoint, or another dataset than the run was trained on.
+        CheckpointError: no run, no checkpoint, or not the dataset that the run was trained on.
         TrainingError: the dataset holds no test task.
-        UnknownNameError: no such protocol; the message lists the nearest names.
+        UnknownNameError: an unknown protocol; the message lists the nearest names.
 
     Example:
         >>> evaluation = evaluate_run("runs/point-robot-tcmrl-seed0", protocol="idaq")  # doctest: +SKIP
@@ -110,7 +110,7 @@ def evaluate_run(
     dataset = run.open_dataset(dataset_path)
     settings = run.record.config.settings.run
     changes = {"protocol": protocol, "episodes": episodes}
-    settings = settings.model_copy(update={key: each for key, each in changes.items() if each is not None})
+    settings = settings.model_copy(update={key: value for key, value in changes.items() if value is not None})
     torch.set_num_threads(settings.threads)
     evaluation = evaluate_open_run(run, dataset, settings, report=report)
     scores = {
@@ -126,12 +126,14 @@ def evaluate_run(
 def evaluate_open_run(
     run: Run, dataset: Dataset, settings: RunSettings, *, report: ProgressCallback = ignore_progress
 ) -> Evaluation:
-    """As `evaluate_run`, for what is already open; `settings` may differ from the run's own."""
+    """As `evaluate_run`, for an open run and dataset; `settings` may differ from those of the run."""
     protocol = PROTOCOLS.get(settings.protocol)()
     tasks = dataset.test_tasks
     if not tasks:
-        raise TrainingError(f"{dataset.folder} holds no test task; build one with `tcmrl-data build --tasks`")
-    on_cpu = run.record.model_copy(update={"device": "cpu"})  # the run's own may be another machine's
+        raise TrainingError(
+            f"{dataset.folder} contains no test task; build one with `tcmrl-data build --tasks`"
+        )
+    on_cpu = run.record.model_copy(update={"device": "cpu"})  # this machine may lack the run's device
     algorithm = create_algorithm(on_cpu, dataset)
     algorithm.load_tensors(run.newest().tensors())
     method, _ = method_of(run.record.config)
@@ -143,26 +145,24 @@ def evaluate_open_run(
         results = _results(arena, tasks, adaptations)
     finally:
         arena.close()
-    regrets = [each.regret for each in results]
-    scores = [each.normalized for each in results]
     return Evaluation(
         algorithm=settings.algorithm,
         environment=dataset.name,
         seed=seed,
         protocol=settings.protocol,
         tasks=results,
-        mean_final=fmean(each.final for each in results),
-        mean_regret=_mean(regrets),
-        mean_normalized=_mean(scores),
-        mean_shuffled=fmean(each.shuffled for each in results),
+        mean_final=fmean(result.final for result in results),
+        mean_regret=_mean([result.regret for result in results]),
+        mean_normalized=_mean([result.normalized for result in results]),
+        mean_shuffled=fmean(result.shuffled for result in results),
         privileged=run.record.privileged or method.capabilities.privileged,
     )
 
 
 def _results(arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Adaptation]) -> list[TaskResult]:
-    own = {task.index: each.contexts for task, each in zip(tasks, adaptations, strict=True)}
+    own = {task.index: adaptation.contexts for task, adaptation in zip(tasks, adaptations, strict=True)}
     others = {task.index: contexts_of_others(arena, task, own) for task in tasks}
-    num_contexts = sum(len(each) for each in (*own.values(), *others.values()))
+    num_contexts = sum(len(contexts) for contexts in (*own.values(), *others.values()))
     arena.begin("final episodes", num_contexts * arena.settings.final_episodes)
     final = _final_episodes(arena, tasks, own)
     shuffled = _final_episodes(arena, tasks, others)
@@ -190,22 +190,23 @@ def _results(arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Adaptati
 
 
 def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) -> list[Context]:
-    """As many contexts of other tasks as the task has of its own; at least one of each lender.
+    """Contexts of other tasks for the shuffled control, as many as the task has itself or more.
 
-    Up to MOST_OTHERS other test tasks, evenly spaced, lend in turn what they were adapted by, unless the
-    task was adapted by the same (two may keep one training task's context under `idaq`), or it holds no
-    trajectory (the prior is no task's). Where nobody is left, training tasks lend stored trajectories.
+    The contexts are those of up to MOST_OTHERS other test tasks, evenly spaced, in turn, and at least one
+    context per other task. A test task is skipped if it shares a context with this task (with `idaq`, two
+    test tasks may keep the context of the same training task) or has an empty context (the prior belongs to
+    no task). If no test task remains, the contexts are stored trajectories of training tasks.
     """
     num_own = len(own[task.index])
     excluded = {_key(context) for context in own[task.index]} | {()}
 
-    def foreign(lenders: Iterable[list[Context]]) -> list[list[Context]]:
-        return [contexts for contexts in lenders if excluded.isdisjoint(map(_key, contexts))]
+    def foreign(candidates: Iterable[list[Context]]) -> list[list[Context]]:
+        return [contexts for contexts in candidates if excluded.isdisjoint(map(_key, contexts))]
 
     others = foreign(contexts for index, contexts in own.items() if index != task.index)
     if not others:
         others = foreign(
-            [arena.stored(each, draw=draw) for draw in range(num_own)] for each in arena.dataset.train_tasks
+            [arena.stored(other, draw=draw) for draw in range(num_own)] for other in arena.dataset.train_tasks
         )
     spread = np.linspace(0, len(others) - 1, min(MOST_OTHERS, len(others))).round().astype(int)
     chosen = [others[index] for index in spread]
@@ -214,21 +215,21 @@ def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) 
 
 
 def _key(context: Context) -> tuple[int, ...]:
-    """Tells contexts apart by the trajectories that they hold."""
+    """Identifies a context by its trajectories."""
     return tuple(id(trajectory) for trajectory in context)
 
 
 def _final_episodes(
     arena: Arena, tasks: Sequence[Task], contexts: dict[int, list[Context]]
 ) -> dict[int, list[Trajectory]]:
-    """Final episodes of every task, under each of its contexts; by task index."""
+    """Final episodes of all tasks with all their contexts, by task index."""
     lanes = [(task, context) for task in tasks for context in contexts[task.index]]
     found: dict[int, list[Trajectory]] = {task.index: [] for task in tasks}
     for repeat in range(arena.settings.final_episodes):
         trajectories = arena.adapted(
             [task for task, _ in lanes],
             [context for _, context in lanes],
-            episode=arena.settings.episodes + repeat,  # seeds that no adaptation episode had
+            episode=arena.settings.episodes + repeat,  # not the seeds of adaptation episodes
         )
         for (task, _), trajectory in zip(lanes, trajectories, strict=True):
             found[task.index].append(trajectory)
@@ -236,13 +237,13 @@ def _final_episodes(
 
 
 def _mean_return(trajectories: Sequence[Trajectory]) -> float:
-    return fmean(each.undiscounted_return for each in trajectories)
+    return fmean(trajectory.undiscounted_return for trajectory in trajectories)
 
 
 def _success(trajectories: Sequence[Trajectory]) -> float | None:
-    if any("success" not in each.extras for each in trajectories):
+    if any("success" not in trajectory.extras for trajectory in trajectories):
         return None
-    return fmean(float(each.extras["success"].any()) for each in trajectories)
+    return fmean(float(trajectory.extras["success"].any()) for trajectory in trajectories)
 
 
 def _share(value: float, low: float, high: float) -> float | None:
@@ -250,5 +251,5 @@ def _share(value: float, low: float, high: float) -> float | None:
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    known = [each for each in values if each is not None]
+    known = [value for value in values if value is not None]
     return fmean(known) if len(known) == len(values) else None

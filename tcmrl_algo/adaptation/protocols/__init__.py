@@ -1,1 +1,1 @@
-"""Protocols of adaptation, one a file."""
+"""Protocols of adaptation, one per file."""

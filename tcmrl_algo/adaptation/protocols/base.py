@@ -1,4 +1,4 @@
-"""What a protocol is: how test tasks are adapted to before the final episodes."""
+"""The interface of protocols, which adapt a policy to test tasks before the final episodes."""
 
 import abc
 from collections.abc import Sequence
@@ -13,12 +13,12 @@ from tcmrl_data.foundation.plugins import Registry
 
 @dataclass(frozen=True)
 class Adaptation:
-    """How one test task was adapted to.
+    """Result of the adaptation to one test task.
 
     Attributes:
-        returns: undiscounted return of each adaptation episode.
-        contexts: what the final policy is adapted by; several where the protocol draws several, and never
-            none. A context without trajectories stands for the prior.
+        returns: undiscounted returns of the adaptation episodes.
+        contexts: contexts of the final policy, one or more, as the protocol draws them. An empty context is
+            the prior.
     """
 
     returns: list[float]
@@ -26,12 +26,12 @@ class Adaptation:
 
 
 class Protocol(abc.ABC):
-    """Adapts to test tasks: a plug-in, stateless, and made without arguments.
+    """Adapts to test tasks. A protocol is a plug-in without state, created without arguments.
 
-    A package declares it as an entry point of the group `tcmrl.protocols`, under `name`.
+    A package declares a protocol as an entry point of the group `tcmrl.protocols` with the name `name`.
 
     Attributes:
-        name: as `--protocol`, `run.protocol` and the `protocols` of an experiment spell it.
+        name: the value of `--protocol`, of `run.protocol` and in `protocols` of an experiment.
 
     Example:
         >>> PROTOCOLS.get("offline").name
@@ -42,10 +42,10 @@ class Protocol(abc.ABC):
 
     @abc.abstractmethod
     def adapt(self, arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
-        """One adaptation per task, each of `arena.settings.episodes` episodes.
+        """Adapts to every task with `arena.settings.episodes` episodes; returns one adaptation per task.
 
         Args:
-            arena: runs episodes, and holds stored trajectories.
+            arena: runs episodes and draws stored trajectories.
             tasks: the test tasks.
         """
 

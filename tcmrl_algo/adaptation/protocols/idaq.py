@@ -1,4 +1,4 @@
-"""IDAQ's protocol: test-time collection under the contexts of training tasks."""
+"""IDAQ's protocol: collects episodes with the contexts of training tasks."""
 
 from collections.abc import Sequence
 from typing import final
@@ -12,10 +12,10 @@ from tcmrl_data import Task, Trajectory
 
 @final
 class IdaqProtocol(Protocol):
-    """Tries contexts of training tasks first, and keeps the context of the episode of the best return.
+    """Tries contexts of training tasks, and keeps the context of the episode with the highest return.
 
-    Four fifths of the episodes each try the context of one training task, evenly spaced among them. The
-    rest try the context that the best episode so far itself shows, and keep it where it does better.
+    Four fifths of the episodes try the contexts of evenly spaced training tasks, one per episode. The other
+    episodes use the best episode so far as their context, and keep that context if the return is higher.
     """
 
     name = "idaq"

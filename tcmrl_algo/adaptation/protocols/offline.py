@@ -1,4 +1,4 @@
-"""Contexts from stored trajectories, as offline meta-RL papers evaluate."""
+"""The usual protocol of offline meta-RL papers: contexts are stored trajectories of the test tasks."""
 
 from collections.abc import Sequence
 from typing import final
@@ -10,7 +10,7 @@ from tcmrl_data import Task
 
 @final
 class OfflineProtocol(Protocol):
-    """Contexts from the test tasks' stored trajectories, drawn anew for every episode."""
+    """Draws a context from the stored trajectories of the test task for every episode."""
 
     name = "offline"
 
@@ -18,7 +18,8 @@ class OfflineProtocol(Protocol):
         draws = range(arena.settings.episodes)
         contexts = [[arena.stored(task, draw=draw) for draw in draws] for task in tasks]
         episodes = [
-            arena.adapted(tasks, [of_task[draw] for of_task in contexts], episode=draw) for draw in draws
+            arena.adapted(tasks, [task_contexts[draw] for task_contexts in contexts], episode=draw)
+            for draw in draws
         ]
         return [
             Adaptation([episode[lane].undiscounted_return for episode in episodes], contexts[lane])

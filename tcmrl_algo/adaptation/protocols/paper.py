@@ -10,10 +10,10 @@ from tcmrl_data import Task, Trajectory
 
 @final
 class PaperProtocol(Protocol):
-    """Random episodes first, then the policy under a context that grows by every episode.
+    """Collects random episodes, then episodes of the policy with all earlier episodes as its context.
 
-    Deviation: the policy acts by its most likely action in the second stage too, without noise. With
-    `random_episodes = 0` a method that needs no trajectories acts by its prior first.
+    Deviation: in the second stage, too, the policy takes its most likely action, without noise. With
+    `random_episodes = 0`, a method that needs no trajectories starts from its prior.
     """
 
     name = "paper"
