@@ -28,7 +28,7 @@ def value_bounds(settings: ActorCriticSettings, problem: Problem) -> tuple[float
     An episode may end after one step, or go on forever: time limits do not cut the sum. The highest V
     includes the largest entropy bonus; the lowest leaves out what a narrow policy's entropy takes away.
     """
-    lowest, highest = (settings.reward_scale * each for each in problem.reward_range)
+    lowest, highest = (settings.reward_scale * reward for reward in problem.reward_range)
     most_steps = 1.0 / (1.0 - settings.gamma)
     bonus = settings.entropy * problem.action_dim * 0.6931471805599453  # ln 2: uniform in [-1, 1]
     return min(lowest, lowest * most_steps), max(highest + bonus, (highest + bonus) * most_steps)
@@ -76,7 +76,7 @@ class ActorCritic(nn.Module):
         *,
         critic_gradient: bool = False,
     ) -> ConditionedRows:
-        """Flattens the steps of all tasks and puts a context beside each.
+        """Flattens the steps of all tasks and puts the context of a step beside it.
 
         Args:
             steps: transitions (tasks, n), or trajectories (tasks, n, steps), whose padding is left out.
@@ -103,7 +103,7 @@ class ActorCritic(nn.Module):
         return rows.where(steps.mask.flatten()) if steps.mask.ndim > 2 else rows
 
     def losses(self, rows: ConditionedRows, generator: torch.Generator) -> tuple[Tensor, Metrics]:
-        """The sum of all losses and its parts; each part trains its own network alone.
+        """The sum of all losses and its parts; every part trains only its own network.
 
         Args:
             rows: transitions with their contexts.

@@ -1,1 +1,1 @@
-"""Methods, one a file: each has NAME, a frozen Config, and create(problem, settings, config) -> Algorithm."""
+"""The installed methods, one per file: a `Method` with its settings and its learner."""

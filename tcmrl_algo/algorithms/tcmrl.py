@@ -112,7 +112,7 @@ class TcmrlLearner(ContextLearner):
         """The weighted terms; those of weight 0 are not computed.
 
         Contexts come from the context trajectories alone; the execution trajectories are what rewards
-        are estimated on, and further examples of each task for the distance-metric loss. Without drawn
+        are estimated on, and further examples of every task for the distance-metric loss. Without drawn
         windows, the contrastive loss takes all windows of the context trajectories.
         """
         weights, encoder = self.config.weights, self.encoder
@@ -132,9 +132,9 @@ class TcmrlLearner(ContextLearner):
             mask = torch.cat([context.mask, execution.mask], dim=1)
             terms["distance"] = self._distance_loss(torch.cat(representations[:2], dim=1), mask)
         total = attention.context.new_zeros(())
-        for name, each in terms.items():
-            total = total + getattr(weights, name) * each
-        metrics = {f"loss/{name}": each for name, each in terms.items()}
+        for name, term in terms.items():
+            total = total + getattr(weights, name) * term
+        metrics = {f"loss/{name}": term for name, term in terms.items()}
         metrics["context/largest_weight"] = attention.weights.amax(dim=-1).mean()
         metrics["context/spread"] = attention.context.std(dim=0).mean()
         return ContextLosses(total, attention.context, metrics)

@@ -62,7 +62,7 @@ class ContextEncoder(nn.Module):
             (torch.tensor([problem.reward_mean]), torch.tensor([problem.reward_std])),
             (problem.change_mean, problem.change_std),
         )
-        mean, std = (torch.cat(each) for each in zip(*parts, strict=True))
+        mean, std = (torch.cat(vectors) for vectors in zip(*parts, strict=True))
         self.scaling = Standardizer(mean, std)
         self.perceptron = Perceptron((len(mean), *hidden, latent), generator=generator)
 
@@ -73,7 +73,7 @@ class ContextEncoder(nn.Module):
         return EncoderInputs(self.scaling(inputs), steps.mask, self.state_action)
 
     def forward(self, *groups: EncoderInputs) -> tuple[Float[Tensor, "..."], ...]:
-        """Representations of each group, (tasks, trajectories, steps, latent), by one pass over them all."""
-        rows = torch.cat([each.inputs.flatten(0, 2) for each in groups])
-        parts = torch.tanh(self.perceptron(rows)).split([each.mask.numel() for each in groups])
-        return tuple(part.unflatten(0, each.mask.shape) for part, each in zip(parts, groups, strict=True))
+        """Representations of every group, (tasks, trajectories, steps, latent), by one forward pass."""
+        rows = torch.cat([group.inputs.flatten(0, 2) for group in groups])
+        parts = torch.tanh(self.perceptron(rows)).split([group.mask.numel() for group in groups])
+        return tuple(part.unflatten(0, group.mask.shape) for part, group in zip(parts, groups, strict=True))

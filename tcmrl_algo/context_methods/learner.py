@@ -26,16 +26,16 @@ ACTOR_CRITIC_STREAM = 1
 
 @dataclass(frozen=True)
 class ContextLosses:
-    """What a context learner makes of one batch.
+    """Contexts and losses of one batch.
 
     Attributes:
-        total: what its parameters descend; weighted sum of its terms.
-        context: what the actor-critic is conditioned on, (tasks, latent) or one of every step; None in a
+        total: the loss of the learner's parameters, a weighted sum of terms.
+        context: input of the actor-critic, (tasks, latent), or one context per step; None in a
             stage that does not train the actor-critic.
         metrics: the terms by name.
         next_context: of the next observations, where it differs from `context`.
         critic_gradient: lets Q's loss train `context`; V, the policy and all targets see it detached.
-        steps: what the actor-critic learns from; the batch's "policy" transitions if left out. Padding of
+        steps: training data of the actor-critic; the batch's "policy" transitions if left out. Padding of
             trajectories (tasks, n, steps) is left out.
     """
 
@@ -48,7 +48,7 @@ class ContextLosses:
 
 
 class ContextLearner(nn.Module, abc.ABC):
-    """All in which context-based methods differ: how trajectories become a context, and what trains that.
+    """How a method turns trajectories into a context, and the losses that train this.
 
     Attributes:
         latent: size of the context.
@@ -81,7 +81,7 @@ class ContextLearner(nn.Module, abc.ABC):
         return {}
 
     def after_step(self, step: int) -> None:
-        """Moves what no optimiser trains, such as momentum copies; does nothing unless overridden."""
+        """Updates what no optimiser trains, such as momentum copies; does nothing unless overridden."""
 
 
 @final

@@ -20,7 +20,7 @@ class Summary:
     Attributes:
         values: one per seed, in the order given.
         mean: of all.
-        iqm: interquartile mean: of what is left without the lowest and the highest quarter, rounded down.
+        iqm: interquartile mean, without the lowest and the highest quarter (sizes rounded down).
         low, high: 95% bootstrap interval of the mean (paper, section 5.2), None under FEWEST_SEEDS.
     """
 

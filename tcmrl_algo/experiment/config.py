@@ -26,7 +26,7 @@ Metric = Literal[
     "attention_zero",
     "attention_nonzero",
 ]
-"""What a claim compares; `reporting.measures` says how each comes from a run."""
+"""What a claim compares; `reporting.measures` says how a run gives them."""
 
 PAPER_PROTOCOLS = ("paper", "offline", "idaq")
 """By which the paper adapts, in its order; what an experiment evaluates by unless it says otherwise."""
@@ -89,7 +89,7 @@ class Experiment(_Table):
         name: of its results folder.
         title: one line.
         source: the figure or table of the paper that it stands for.
-        seeds: every method is run under each of them.
+        seeds: every method is run with every seed.
         environments: by name.
         methods: by label, in the order of tables and figures.
         training: changes of the training table that all runs share.
@@ -173,7 +173,7 @@ def read_experiment(tables: Mapping[str, Any], *, place: str) -> Experiment:
 
 def experiment_names() -> list[str]:
     """Experiments that come with the package."""
-    names = [each.name for each in _shipped().iterdir()]
+    names = [file.name for file in _shipped().iterdir()]
     return sorted(name.removesuffix(".toml") for name in names if name.endswith(".toml"))
 
 

@@ -85,7 +85,9 @@ def run_job(job: Job, report: Send) -> str:
         timed_steps, seconds = _train_to(step, job, dataset, report)
         began = time.perf_counter()
         chosen = job.protocols if step == job.points()[-1] else job.protocols[:1]
-        evaluations = {each: evaluate_run(folder, protocol=each, dataset_path=job.dataset) for each in chosen}
+        evaluations = {
+            protocol: evaluate_run(folder, protocol=protocol, dataset_path=job.dataset) for protocol in chosen
+        }
         first = evaluations[job.protocols[0]]
         point = CurvePoint(
             step=step,
@@ -136,7 +138,7 @@ def _train_to(step: int, job: Job, dataset: Dataset, report: Send) -> tuple[int,
 
 def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: Mapping[str, Evaluation]) -> RunResult:
     run = open_run(job.folder)
-    timed, seconds = sum(each.timed_steps for each in curve), sum(each.seconds for each in curve)
+    timed, seconds = sum(point.timed_steps for point in curve), sum(point.seconds for point in curve)
     steps = run.record.steps
     return RunResult(
         **job.model_dump(
@@ -152,10 +154,10 @@ def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: Mapping[str, E
         versions=run.record.versions | {"tcmrl": importlib.metadata.version("tcmrl")},
         digest=tensors_digest(run.newest().tensors()),
         curve=curve,
-        evaluations={name: each.to_json() for name, each in evaluations.items()},
+        evaluations={name: found.to_json() for name, found in evaluations.items()},
         training_seconds=seconds * steps / timed if timed else None,
-        evaluation_seconds=sum(each.evaluation_seconds for each in curve),
-        peak_memory=max(each.device_memory or each.peak_memory for each in curve),
+        evaluation_seconds=sum(point.evaluation_seconds for point in curve),
+        peak_memory=max(point.device_memory or point.peak_memory for point in curve),
     )
 
 

@@ -65,7 +65,7 @@ def plan_runs(
 
     Raises:
         SelectionError: a dataset is missing, of another environment, without test tasks, or without the
-            snapshots that a method asks for.
+            snapshots that a method needs.
         TrainingError: an unknown method, algorithm, profile or protocol, or changes that do not validate.
     """
     _check_protocols(experiment)
@@ -103,7 +103,7 @@ def check_same(done: Mapping[str, Any], planned: Mapping[str, Any], *, place: Pa
     for key in sorted(before.keys() | now.keys()):
         if before.get(key) != now.get(key):
             raise CheckpointError(
-                f"{place} was made with {key} {before.get(key)!r}, this experiment asks for "
+                f"{place} was made with {key} {before.get(key)!r}, this experiment has "
                 f"{now.get(key)!r}; choose another --out, or delete that run"
             )
 
@@ -154,7 +154,7 @@ def resolve_method(
     """
     method = experiment.methods[label]
     changes = (experiment.training, experiment.environments[environment].training, method.training)
-    texts = [text for each in changes for text in override_texts(each)]
+    texts = [text for table_changes in changes for text in override_texts(table_changes)]
     if steps is not None:
         texts.append(f"run.steps={steps}")
     config = resolve(table, place=place, algorithm=method.algorithm, overrides=texts, fallback=fallback)
@@ -170,7 +170,7 @@ def _config(
     experiment: Experiment, dataset: Dataset, profile: str, label: str, steps: int | None
 ) -> TrainingConfig:
     place = f"experiment {experiment.name!r}, method {label!r} on {dataset.name!r}, profile {profile!r}"
-    table = {str(name): each for name, each in dataset.manifest.training.items()}.get(profile)
+    table = {str(name): values for name, values in dataset.manifest.training.items()}.get(profile)
     if table is None:
         known = ", ".join(dataset.manifest.training)
         raise TrainingError(f"{place}: the dataset has no such training table; it has {known}")
@@ -193,7 +193,7 @@ def _leaves(value: Any, prefix: str = "") -> list[tuple[str, Any]]:
     if isinstance(value, Mapping):
         return [
             leaf
-            for key, each in value.items()
-            for leaf in _leaves(each, f"{prefix}.{key}".removeprefix(".").removeprefix("training."))
+            for key, item in value.items()
+            for leaf in _leaves(item, f"{prefix}.{key}".removeprefix(".").removeprefix("training."))
         ]
     return [(prefix, value)]

@@ -113,8 +113,8 @@ class RunResult(_Record):
         return [
             shared
             | {"protocol": protocol}
-            | {name: each[f"mean_{name}"] for name in ("final", "regret", "normalized", "shuffled")}
-            for protocol, each in self.evaluations.items()
+            | {name: evaluation[f"mean_{name}"] for name in ("final", "regret", "normalized", "shuffled")}
+            for protocol, evaluation in self.evaluations.items()
         ]
 
 
@@ -157,5 +157,5 @@ def read_results(folder: Path, experiment: Experiment) -> list[RunResult]:
     """
     results = [read_record(RunResult, file, remedy=AGAIN) for file in sorted(folder.glob("runs/*.json"))]
     order = list(experiment.methods)
-    known = [each for each in results if each.method in order]
-    return sorted(known, key=lambda each: (each.environment, order.index(each.method), each.seed))
+    known = [result for result in results if result.method in order]
+    return sorted(known, key=lambda result: (result.environment, order.index(result.method), result.seed))

@@ -1,4 +1,4 @@
-"""Runs an experiment: plans it whole, skips what is done, goes on with what was killed, keeps one table."""
+"""Runs an experiment: plans all runs, skips finished ones, resumes killed ones, and writes one table."""
 
 import contextlib
 import os
@@ -76,7 +76,7 @@ def run_experiment(
     device: str = "cpu",
     report: Callable[[FinishedRun], None] = ignore,
 ) -> ExperimentReport:
-    """Runs an experiment, or what is missing of it; nothing starts before everything is checked.
+    """Runs an experiment, without the runs that are finished; checks all of it before the first run starts.
 
     Args:
         experiment: what to run.
@@ -128,12 +128,12 @@ def run_experiment(
                 failed.append(f"{name}: {error}")
                 replace_file(error_file(folder), f"{error}\n".encode())
             _write_table(out, experiment)
-            ended = sum(each is not None for each in found.values()) + len(failed)
+            ended = sum(result is not None for result in found.values()) + len(failed)
             pace = (time.perf_counter() - began) / (ended - present)
             is_known = ended - present >= min(workers, len(jobs))
             left = pace * (len(plan) - ended) if is_known else None
             report(FinishedRun(name, result, error, ended, len(plan), left))
-    results = tuple(each for each in found.values() if each is not None)
+    results = tuple(result for result in found.values() if result is not None)
     return ExperimentReport(out, results, present, tuple(failed), time.perf_counter() - began)
 
 
@@ -197,7 +197,7 @@ def _job(run: PlannedRun, experiment: Experiment, out: Path, *, threads: int, de
 
 
 def _run(jobs: dict[str, Job], workers: int) -> Iterator[tuple[str, str | None]]:
-    """Runs end in any order, each with its error or None; closing the iterator ends what still runs."""
+    """Yields the id of every run as it ends, with its error or None; closing the iterator ends the others."""
     units = [
         Unit(
             name,

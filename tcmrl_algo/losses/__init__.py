@@ -1,1 +1,1 @@
-"""Equations, one pure function each: torch alone."""
+"""Equations as pure functions, which import torch only."""

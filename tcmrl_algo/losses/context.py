@@ -1,4 +1,4 @@
-"""Losses of contexts as pure functions: tensors in, a scalar out, one equation of the paper each.
+"""Losses of contexts as pure functions: tensors in, a scalar out, one function per equation of the paper.
 
 The paper is "TCMRL", whose equation numbers are quoted. `mask` is True on real entries and False on padding;
 padding never changes a value or a gradient. Wherever the paper sums over time, these functions take the mean

@@ -34,7 +34,7 @@ class Capabilities:
         explores: it collects its first episodes in its own way instead of uniformly.
         stateful: its controllers adapt within an episode.
         privileged: it may see task parameters, as a control; every record of its runs says so.
-        needs_trajectories: it cannot adapt to no trajectory at all.
+        needs_trajectories: it cannot adapt without a trajectory.
     """
 
     blind: bool = False
@@ -52,7 +52,7 @@ class Algorithm(abc.ABC):
 
     @abc.abstractmethod
     def update(self, batch: Batch, step: int) -> Metrics:
-        """One training step, a function of the current tensors, the batch and the step's number.
+        """Does one training step, a function of the current tensors, the batch and the step's number.
 
         Args:
             batch: holds what the step's stage requested.
@@ -79,7 +79,7 @@ class Algorithm(abc.ABC):
         """Acts in the first stage of the protocol `paper`; uniformly, unless a method collects otherwise.
 
         Args:
-            trajectories: what lane i has collected so far; nothing at first.
+            trajectories: those that lane i has collected so far; none at first.
         """
         return UniformController()
 
@@ -93,7 +93,7 @@ class Algorithm(abc.ABC):
 
 
 class Method(abc.ABC, Generic[ConfigT]):
-    """A method as a plug-in: stateless, and made without arguments.
+    """A method as a plug-in: a stateless object, created without arguments.
 
     A package declares it as an entry point of the group `tcmrl.algorithms`, under `name`.
 

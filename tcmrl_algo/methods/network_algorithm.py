@@ -1,4 +1,4 @@
-"""What a method without an actor-critic needs to write no more than its loss and its policy."""
+"""Base classes for methods without an actor-critic, which then define only a loss and a policy."""
 
 import abc
 from collections.abc import Callable, Collection, Mapping
@@ -50,7 +50,7 @@ class NetworkAlgorithm(Algorithm):
 
     @abc.abstractmethod
     def loss(self, batch: Batch, step: int) -> tuple[Float[Tensor, ""], Metrics]:
-        """What the networks descend in a step, and the metrics of the step."""
+        """The loss of the networks in a step, and the metrics of the step."""
 
     @final
     def update(self, batch: Batch, step: int) -> Metrics:

@@ -90,7 +90,10 @@ class MomentsRecord(BaseModel):
         """The record of a sampler's statistics."""
         values = {name: getattr(moments, name) for name in cls.model_fields}
         return cls.model_validate(
-            {name: each.tolist() if isinstance(each, np.ndarray) else each for name, each in values.items()}
+            {
+                name: value.tolist() if isinstance(value, np.ndarray) else value
+                for name, value in values.items()
+            }
         )
 
 

@@ -1,4 +1,4 @@
-"""The stages of training: what every one trains, from which batches, and for how long."""
+"""The stages of training: the parts that a stage trains, the batches it reads, and its length."""
 
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass

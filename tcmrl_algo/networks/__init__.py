@@ -1,1 +1,1 @@
-"""Networks and their optimiser: torch alone."""
+"""Networks and their optimiser, which import torch only."""

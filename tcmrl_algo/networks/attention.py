@@ -21,7 +21,7 @@ def mean_representation(
 
 @dataclass(frozen=True)
 class Attention:
-    """What the extractor makes of the transitions of each lane.
+    """The extractor's output for the transitions of every lane.
 
     Attributes:
         representations: (lanes, steps, latent), c_t.

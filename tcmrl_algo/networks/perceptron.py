@@ -30,7 +30,7 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
 
 def call_frozen(module: nn.Module, *inputs: Tensor) -> Tensor:
     """The module's output with its parameters held fixed: gradients reach the inputs alone."""
-    parameters = {name: each.detach() for name, each in module.named_parameters()}
+    parameters = {name: parameter.detach() for name, parameter in module.named_parameters()}
     result: Tensor = torch.func.functional_call(module, parameters, inputs)
     return result
 
@@ -73,14 +73,14 @@ class Perceptron(nn.Module):
 
 def set_hidden_dtype(module: nn.Module, dtype: torch.dtype) -> None:
     """Lets the hidden layers of all perceptrons in a module multiply in float32 or bfloat16."""
-    for each in module.modules():
-        if isinstance(each, Perceptron):
-            each.hidden_dtype = dtype
+    for part in module.modules():
+        if isinstance(part, Perceptron):
+            part.hidden_dtype = dtype
 
 
 @final
 class PerceptronEnsemble(nn.Module):
-    """Several ReLU perceptrons of one shape with one output each.
+    """Several ReLU perceptrons of one shape, every one with a single output.
 
     One product per member and layer: on a CPU the batched product of all members is slower.
 

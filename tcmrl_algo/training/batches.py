@@ -78,7 +78,7 @@ def open_batches(
 
 
 def split_request(request: BatchRequest) -> tuple[BatchRequest, BatchRequest]:
-    """The request's transitions, and its trajectories and windows; no draw depends on the other half."""
+    """A request of the transitions, and one of the trajectories and windows; kinds draw independently."""
     single = {name: kind for name, kind in request.kinds.items() if isinstance(kind, Transitions)}
     longer = {name: kind for name, kind in request.kinds.items() if name not in single}
     return replace(request, kinds=single), replace(request, kinds=longer)

@@ -115,7 +115,7 @@ class Run:
     def checkpoints(self) -> list[Checkpoint]:
         """Published checkpoints, ascending by step."""
         folders = sorted(self.folder.glob("checkpoints/step_" + 9 * "[0-9]"))
-        return [Checkpoint(each, int(each.name.removeprefix("step_"))) for each in folders]
+        return [Checkpoint(folder, int(folder.name.removeprefix("step_"))) for folder in folders]
 
     def newest(self) -> Checkpoint:
         """The checkpoint of the highest step.
@@ -130,7 +130,7 @@ class Run:
 
     def save(self, step: int, tensors: Mapping[str, Tensor]) -> None:
         """Publishes a checkpoint by one rename, then removes what is old or was never finished."""
-        content = safetensors.torch.save({name: each.cpu().contiguous() for name, each in tensors.items()})
+        content = safetensors.torch.save({name: value.cpu().contiguous() for name, value in tensors.items()})
         record = CheckpointRecord(step=step, sha256=sha256(content))
         target = self.folder / "checkpoints" / f"step_{step:09d}"
         make_folders(target.parent)

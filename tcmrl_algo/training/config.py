@@ -160,5 +160,5 @@ def _check_names(tables: Mapping[str, Any], place: str) -> None:
     for name in sorted(set(tables) - set(METHODS.names())):
         known = ", ".join(TrainingSettings.model_fields)
         raise TrainingError(
-            f"{place}: unknown table {name!r}; known are {known}, and one named after each algorithm"
+            f"{place}: unknown table {name!r}; known are {known}, and tables named after an algorithm"
         )

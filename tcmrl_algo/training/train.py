@@ -57,7 +57,7 @@ class TrainingProgress:
 
 @dataclass(frozen=True)
 class TrainingReport:
-    """What a finished training run leaves.
+    """The result of a finished training run.
 
     Attributes:
         run: its folder and record.
@@ -96,7 +96,7 @@ def train_run(
     """Trains a new run.
 
     Args:
-        dataset: what to learn from; its training tasks alone are used.
+        dataset: what to learn from; only its training tasks are used.
         out: the run's folder, made here.
         config: the resolved training table.
         profile: whose table it was; recorded.
@@ -178,7 +178,7 @@ def resume_run(
     run = open_run(out)
     run.check_dataset(dataset)
     changes = {"steps": steps, "device": device, "dataset": str(dataset.folder.resolve())}
-    record = run.record.model_copy(update={key: each for key, each in changes.items() if each is not None})
+    record = run.record.model_copy(update={key: value for key, value in changes.items() if value is not None})
     start = run.checkpoints()[-1].step if run.checkpoints() else 0
     if start > record.steps:
         raise CheckpointError(f"{out} is at step {start} already, beyond --steps {record.steps}")
@@ -259,7 +259,7 @@ def _train(
             metrics = algorithm.update(next(stream), step)
             _check_sizes(metrics, algorithm.limits(), step)
             if step % settings.log_every == 0 or step == last:
-                values = {name: float(each) for name, each in metrics.items()}
+                values = {name: float(value) for name, value in metrics.items()}
                 now = time.perf_counter()
                 seconds = max(now - logged_at, 1e-9)
                 rate, share = (step - logged_step) / seconds, (stream.waited - logged_wait) / seconds
@@ -285,7 +285,7 @@ def _check_sizes(metrics: Mapping[str, Tensor], limits: Mapping[str, float], ste
         TrainingError: with the first such metric, its value, its limit and the step.
     """
     largest = [limits.get(name, sys.float_info.max) for name in metrics]
-    sizes = torch.stack([each.double().abs() for each in metrics.values()]).tolist()
+    sizes = torch.stack([value.double().abs() for value in metrics.values()]).tolist()
     for name, size, limit in zip(metrics, sizes, largest, strict=True):
         if math.isnan(size) or size > limit:
             what = f"is {size:.3g}, beyond {limit:.3g}," if name in limits else "is not finite"
@@ -298,7 +298,7 @@ def _check_finite(values: Mapping[str, Tensor], step: int) -> None:
     Raises:
         TrainingError: with the first such quantity and the step.
     """
-    bad = [torch.isfinite(each).all() for each in values.values()]
+    bad = [torch.isfinite(value).all() for value in values.values()]
     if bool(torch.stack(bad).all()):
         return
     name = next(name for name, finite in zip(values, bad, strict=True) if not finite)
