@@ -9,12 +9,10 @@ from tcmrl_data.behavior.snapshot import ScriptedDescription, Snapshot
 from tcmrl_data.build.driver import Driver, make_groups
 from tcmrl_data.build.part import seal_part
 from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.provenance import provenance
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.disk import publish_folder
-from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.manifest import References, part_folder
 
@@ -50,29 +48,27 @@ def generate_dataset(
     )
     recipe = tcmrl_data.load_recipe(environment_name, overrides=overrides, behavior="sac")
     chosen = [task for task in choose_tasks(recipe) if task.split == "train"][:tasks]
-    environment = recipe.make_environment()
+    plan = BuildPlan.of_tasks(recipe, seed=seed, tasks=chosen)
     make_groups(folder, chosen)
     for task in chosen:
         for step in steps:
             if not (folder / part_folder(task.index, step)).is_dir():
-                _publish(folder, recipe, task, step, seed=seed)
-    Driver(BuildPlan.of_tasks(recipe, seed=seed, tasks=chosen), folder).write_manifest()
-    return len(chosen) * snapshots * episodes * environment.settings.horizon
+                _publish(folder, plan, task, step)
+    Driver(plan, folder).write_manifest()
+    return len(chosen) * snapshots * episodes * plan.environment.settings.horizon
 
 
-def _publish(folder: Path, recipe: Recipe, task: Task, step: int, *, seed: int) -> None:
-    environment = recipe.make_environment()
-    random = np.random.default_rng([seed, task.index, step])
-    trajectories = [_noise(random, environment) for _ in range(recipe.rollouts.episodes)]
+def _publish(folder: Path, plan: BuildPlan, task: Task, step: int) -> None:
+    random = np.random.default_rng([plan.seed, task.index, step])
+    trajectories = [_noise(random, plan.environment) for _ in range(plan.recipe.rollouts.episodes)]
     snapshot = Snapshot(step, ScriptedDescription(observation="stored", noise=1.0))
     _, files = seal_part(
-        recipe,
-        seed,
+        plan,
         task=task,
         snapshot=snapshot,
         trajectories=trajectories,
         references=References(uniform=-1.0, oracle=0.0, scripted=None),
-        provenance=provenance(environment, {"generated": "white noise"}),
+        behavior={"generated": "white noise"},
     )
     publish_folder(folder, folder / part_folder(task.index, step), files, attempt="generated")
 

@@ -27,6 +27,7 @@ from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.build.part import roll_out_part
+from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.recipe.tasks import choose_tasks
 
@@ -38,9 +39,9 @@ Returns = npt.NDArray[np.float64]
 
 def curves(recipe: Recipe, tasks: list[Task], seed: int) -> Returns:
     """Mean returns at the recipe's snapshots after the first, (tasks, snapshots)."""
-    environment = recipe.make_environment()
+    plan = BuildPlan.of_tasks(recipe, seed=seed, tasks=tasks)
     context = BehaviorContext(
-        environment=environment,
+        environment=plan.environment,
         tasks=tasks,
         seed=seed,
         observation=recipe.behavior.observation,
@@ -49,11 +50,9 @@ def curves(recipe: Recipe, tasks: list[Task], seed: int) -> Returns:
         checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
     )
     found = defaultdict(list)
-    for task, snapshot in recipe.make_source().snapshots(context):
-        lanes = environment.lanes([task.parameters] * recipe.rollouts.lanes)
-        episodes = roll_out_part(
-            recipe, seed, environment=environment, task=task, snapshot=snapshot, lanes=lanes
-        )
+    for task, snapshot in plan.source.snapshots(context):
+        lanes = plan.environment.lanes([task.parameters] * recipe.rollouts.lanes)
+        episodes = roll_out_part(plan, task=task, snapshot=snapshot, lanes=lanes)
         lanes.close()
         found[task.index].append(np.mean([each.undiscounted_return for each in episodes]))
     return np.array([found[task.index][1:] for task in tasks])

@@ -23,7 +23,7 @@ from tcmrl_data.build.events import EVENTS
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_file
 from tcmrl_data.foundation.errors import LockedError, ManifestError, NondeterminismError, SnapshotError
 from tcmrl_data.store.arrays import array_digests, encode_arrays
-from tcmrl_data.store.manifest import MANIFEST, part_folder, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, part_folder, read_manifest, read_part_record
 from tcmrl_data.verification import repair as repair_module
 from tcmrl_data.verification import replay as replay_module
 from tcmrl_data.verification.garbage import collect_garbage
@@ -423,3 +423,16 @@ def test_a_dataset_in_use_cannot_be_repaired(tiny_copy: Copy) -> None:
     folder = tiny_copy()
     with lock_file(folder / LOCK, "the dataset"), pytest.raises(LockedError, match=f"process {os.getpid()}"):
         repair_dataset(folder)
+
+
+def test_a_replay_needs_no_behavior_source(tiny_copy: Copy) -> None:
+    """A part's policy lies in the part: the package that trained it need not be installed."""
+    folder = tiny_copy()
+    manifest = read_manifest(folder)
+    behavior = manifest.recipe.behavior.model_copy(update={"source": "not-installed"})
+    recipe = manifest.recipe.model_copy(update={"behavior": behavior})
+    part = folder / part_folder(3, 100)
+    replay = replay_module.replay_part(
+        part, read_part_record(part / "part.json"), manifest.model_copy(update={"recipe": recipe})
+    )
+    assert replay.problems == ()

@@ -19,7 +19,6 @@ from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
 from tcmrl_data.foundation.disk import publish_folder
 from tcmrl_data.foundation.errors import BuildError, NondeterminismError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
-from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
 from tcmrl_data.store.manifest import (
     DATA_VERSION,
@@ -96,30 +95,22 @@ class PartMaker:
         plan, task = self._plan, self.task
         if self._lanes is None:
             self._lanes = plan.environment.lanes(self._parameters)
-        trajectories = roll_out_part(
-            plan.recipe,
-            plan.seed,
-            environment=plan.environment,
-            task=task,
-            snapshot=snapshot,
-            lanes=self._lanes,
-        )
+        trajectories = roll_out_part(plan, task=task, snapshot=snapshot, lanes=self._lanes)
         place = f"{plan.environment.name}, task {task.index}, snapshot step {snapshot.step}"
         _check_finite(trajectories, place)
         if self._references is None:
             self._references = self._measure_references()
         return seal_part(
-            plan.recipe,
-            plan.seed,
+            plan,
             task=task,
             snapshot=snapshot,
             trajectories=trajectories,
             references=self._references,
-            provenance=provenance(plan.environment, self._behavior),
+            behavior=self._behavior,
         )
 
     def _measure_references(self) -> References:
-        """Uniform, oracle and noise-free scripted returns of the task, from the recipe's episodes each."""
+        """Uniform, oracle and noise-free scripted returns of the task, over as many episodes as in a part."""
         environment, lanes = self._plan.environment, self._lanes
         assert lanes is not None
         key = (self._plan.seed, environment.name, self.task.index)
@@ -148,31 +139,39 @@ class PartMaker:
 
 
 def seal_part(
-    recipe: Recipe,
-    seed: int,
+    plan: BuildPlan,
     *,
     task: Task,
     snapshot: Snapshot,
     trajectories: Sequence[Trajectory],
     references: References,
-    provenance: Mapping[str, Any],
+    behavior: Mapping[str, Any],
 ) -> tuple[str, dict[str, bytes]]:
-    """The id and all files of a part, `part.json` included."""
+    """The id and all files of a part, `part.json` included.
+
+    Args:
+        plan: of the build.
+        task: the part's.
+        snapshot: the policy.
+        trajectories: its rollouts.
+        references: of the task.
+        behavior: what the behavior source records with its parts.
+    """
     arrays = pack(trajectories)
-    digests = {
-        name: ArrayRecord.model_validate_json(canonical_json(each))
-        for name, each in array_digests(arrays).items()
+    records = {
+        name: ArrayRecord.model_validate_json(canonical_json(record))
+        for name, record in array_digests(arrays).items()
     }
     identity = Identity(
         schema_version=SCHEMA_VERSION,
         data_version=DATA_VERSION,
-        settings=recipe.unit_settings(),
+        settings=plan.recipe.unit_settings(),
         task=task.index,
         parameters=dict(task.parameters),
         step=snapshot.step,
-        seed=seed,
+        seed=plan.seed,
         policy=snapshot.digest(),
-        arrays=digests,
+        arrays=records,
     )
     files = encode_arrays(arrays) | snapshot.files()
     record = PartRecord(
@@ -182,22 +181,21 @@ def seal_part(
         statistics=statistics(trajectories),
         references=references,
         files={name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())},
-        provenance=dict(provenance),
+        provenance=dict(provenance(plan.environment, behavior)),
     )
     return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}
 
 
-def roll_out_part(
-    recipe: Recipe, seed: int, *, environment: Environment, task: Task, snapshot: Snapshot, lanes: Lanes
-) -> list[Trajectory]:
+def roll_out_part(plan: BuildPlan, *, task: Task, snapshot: Snapshot, lanes: Lanes) -> list[Trajectory]:
     """The recipe's episodes of one snapshot, in lane batches; each episode has its own keyed seeds."""
+    environment = plan.environment
     controller = snapshot.controller(environment, [task.parameters] * lanes.num_lanes)
-    key = (seed, environment.name, task.index)
+    key = (plan.seed, environment.name, task.index)
     return _roll_out_batches(
         environment,
         lanes,
         controller,
-        num_episodes=recipe.rollouts.episodes,
+        num_episodes=plan.recipe.rollouts.episodes,
         reset_key=(*key, Purpose.ROLLOUT_RESET, snapshot.step),
         noise_key=(*key, Purpose.ROLLOUT_NOISE, snapshot.step),
     )

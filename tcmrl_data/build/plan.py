@@ -1,5 +1,6 @@
 """A build's plan: what follows from a recipe, derived once and handed on."""
 
+import functools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
@@ -25,22 +26,18 @@ class BuildPlan:
         recipe: the resolved recipe.
         seed: root seed of behavior training and rollouts.
         environment: the recipe's.
-        source: the recipe's behavior source.
         tasks: the tasks to build, ascending by index.
-        groups: the same tasks, those of one unit together.
     """
 
     recipe: Recipe
     seed: int
     environment: Environment
-    source: BehaviorSource
     tasks: tuple[Task, ...]
-    groups: tuple[tuple[Task, ...], ...]
 
     @classmethod
     def of_tasks(cls, recipe: Recipe, *, seed: int, tasks: Iterable[Task]) -> "BuildPlan":
         """The plan of a recipe for tasks that are known already."""
-        return cls(recipe, seed, recipe.make_environment(), recipe.make_source(), (), ())._holding(tasks)
+        return cls(recipe, seed, recipe.make_environment(), _ordered(tasks))
 
     def with_tasks(self, indices: Iterable[int]) -> "BuildPlan":
         """The same plan, with further tasks of the environment.
@@ -49,11 +46,18 @@ class BuildPlan:
             TaskError: an index outside the task set.
         """
         wanted = {*indices, *(task.index for task in self.tasks)}
-        return self._holding(pick_tasks(draw_tasks(self.environment), self.recipe.build, sorted(wanted)))
+        tasks = pick_tasks(draw_tasks(self.environment), self.recipe.build, sorted(wanted))
+        return replace(self, tasks=_ordered(tasks))
 
-    def _holding(self, tasks: Iterable[Task]) -> "BuildPlan":
-        ordered = tuple(sorted(tasks, key=lambda task: task.index))
-        return replace(self, tasks=ordered, groups=tuple(group_tasks(ordered, self.source.group_size)))
+    @functools.cached_property
+    def source(self) -> BehaviorSource:
+        """The recipe's behavior source; made when it is needed, since a replay needs none."""
+        return self.recipe.make_source()
+
+    @functools.cached_property
+    def groups(self) -> tuple[tuple[Task, ...], ...]:
+        """The tasks, those of one unit together."""
+        return tuple(group_tasks(self.tasks, self.source.group_size))
 
     @property
     def part_bytes(self) -> int:
@@ -72,6 +76,10 @@ class BuildPlan:
             + int(simulators * self.environment.simulator_bytes)
             + PART_COPIES * self.part_bytes
         )
+
+
+def _ordered(tasks: Iterable[Task]) -> tuple[Task, ...]:
+    return tuple(sorted(tasks, key=lambda task: task.index))
 
 
 def plan_build(recipe: Recipe, *, seed: int = 0, tasks: Sequence[int] | None = None) -> BuildPlan:

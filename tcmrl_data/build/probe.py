@@ -19,7 +19,6 @@ from tcmrl_data.build.part import PartMaker
 from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.unit import UnitSpec
 from tcmrl_data.engine.worker import Send, serve
-from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.store.manifest import part_folder, read_part_record
 
@@ -77,11 +76,11 @@ def _measure(values: dict[str, Any], send: Send) -> str:
     torch.set_num_threads(1)  # as a build's workers
     send({"kind": "started"})
     spec = UnitSpec.from_json(values)
-    source = spec.recipe.make_source().with_warmup(WARMUP_STEPS)
-    environment = spec.recipe.make_environment()
+    plan = _probe_plan(spec)
+    source = plan.source.with_warmup(WARMUP_STEPS)
     clock = Clock(source.warmup_steps * len(spec.tasks))
     context = BehaviorContext(
-        environment=environment,
+        environment=plan.environment,
         tasks=spec.tasks,
         seed=spec.seed,
         observation=spec.recipe.behavior.observation,
@@ -94,7 +93,7 @@ def _measure(values: dict[str, Any], send: Send) -> str:
         for index, (task, snapshot) in enumerate(source.snapshots(context)):
             if index == 0:
                 setup = time.monotonic() - started
-                parts = _measure_parts(spec, environment, task, snapshot)
+                parts = _measure_parts(spec, plan, task, snapshot)
                 clock.restart()
             if index == 1 and not source.training_steps:
                 break
@@ -104,16 +103,18 @@ def _measure(values: dict[str, Any], send: Send) -> str:
     return ""
 
 
-def _measure_parts(
-    spec: UnitSpec, environment: Environment, task: Task, snapshot: Snapshot
-) -> dict[str, float]:
-    """Seconds of a task's first part and of one more, and how many times longer full episodes would be."""
-    lanes, episodes = spec.recipe.rollouts.lanes, spec.recipe.rollouts.episodes
-    rollouts = spec.recipe.rollouts.model_copy(update={"episodes": lanes})
+def _probe_plan(spec: UnitSpec) -> BuildPlan:
+    """The plan of the unit with a single lane batch per part."""
+    rollouts = spec.recipe.rollouts.model_copy(update={"episodes": spec.recipe.rollouts.lanes})
     recipe = spec.recipe.model_copy(update={"rollouts": rollouts})
+    return BuildPlan.of_tasks(recipe, seed=spec.seed, tasks=spec.tasks)
+
+
+def _measure_parts(spec: UnitSpec, plan: BuildPlan, task: Task, snapshot: Snapshot) -> dict[str, float]:
+    """Seconds of a task's first part and of one more, and how many times longer full episodes would be."""
+    batches = spec.recipe.rollouts.episodes / plan.recipe.rollouts.episodes
     seconds = []
     with tempfile.TemporaryDirectory(prefix="tcmrl-probe-") as name:
-        plan = BuildPlan.of_tasks(recipe, seed=spec.seed, tasks=spec.tasks)
         maker = PartMaker(Path(name), plan, task=task, behavior={})
         (Path(name) / part_folder(task.index, 0)).parent.mkdir(parents=True)
         for step in (0, 1):
@@ -121,10 +122,10 @@ def _measure_parts(
             maker.publish(dataclasses.replace(snapshot, step=step), lambda message: None)
             if len(spec.tasks) > 1:
                 maker.close()
-            seconds.append((time.monotonic() - started) * episodes / lanes)
+            seconds.append((time.monotonic() - started) * batches)
         maker.close()
         found = read_part_record(Path(name) / part_folder(task.index, 0) / "part.json").statistics
-    stretch = environment.settings.horizon * found.episodes / max(1, found.steps)
+    stretch = plan.environment.settings.horizon * found.episodes / max(1, found.steps)
     return {"first_part": seconds[0], "part": seconds[1], "stretch": stretch}
 
 

@@ -12,8 +12,8 @@ from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import read_snapshot
 from tcmrl_data.build.part import roll_out_part
+from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.provenance import provenance
-from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.store.arrays import pack, read_arrays
@@ -62,10 +62,10 @@ def replay_part(folder: Path, record: PartRecord, manifest: Manifest) -> Replay:
     exact = False
     try:
         _check_cost(record, manifest)
-        environment = manifest.recipe.make_environment()
-        here = provenance(environment, {})
+        plan = BuildPlan.of_tasks(manifest.recipe, seed=manifest.seed, tasks=_tasks(manifest))
+        here = provenance(plan.environment, {})
         exact = all(record.provenance.get(key) == here[key] for key in ("cpu", "packages", "physics"))
-        made = _make_again(folder, record, manifest, environment)
+        made = _make_again(folder, record, plan)
         stored = read_arrays(folder, identity.arrays)
         compare = _bit_problems if exact else _drift_problems
         problems = tuple(compare(stored, made))
@@ -84,28 +84,16 @@ def _check_cost(record: PartRecord, manifest: Manifest) -> None:
         raise ValueError(f"{lanes} lanes of {horizon} steps are more than the part's size justifies")
 
 
-def _make_again(
-    folder: Path, record: PartRecord, manifest: Manifest, environment: Environment
-) -> dict[str, npt.NDArray[Any]]:
-    index = record.identity.task
-    task = next(
-        Task(each.index, each.split, each.parameters) for each in manifest.tasks if each.index == index
-    )
+def _tasks(manifest: Manifest) -> list[Task]:
+    return [Task(task.index, task.split, task.parameters) for task in manifest.tasks]
+
+
+def _make_again(folder: Path, record: PartRecord, plan: BuildPlan) -> dict[str, npt.NDArray[Any]]:
+    task = next(task for task in plan.tasks if task.index == record.identity.task)
     snapshot = read_snapshot(folder, record.identity.step)
-    with (
-        _one_thread(),
-        contextlib.closing(environment.lanes([task.parameters] * manifest.recipe.rollouts.lanes)) as lanes,
-    ):
-        return pack(
-            roll_out_part(
-                manifest.recipe,
-                manifest.seed,
-                environment=environment,
-                task=task,
-                snapshot=snapshot,
-                lanes=lanes,
-            )
-        )
+    parameters = [task.parameters] * plan.recipe.rollouts.lanes
+    with _one_thread(), contextlib.closing(plan.environment.lanes(parameters)) as lanes:
+        return pack(roll_out_part(plan, task=task, snapshot=snapshot, lanes=lanes))
 
 
 @contextlib.contextmanager
