@@ -118,9 +118,7 @@ def test_what_the_cluster_can_never_place_is_refused_at_once(
     ray_cluster: Any, tmp_path: Path, asked: str, told: str
 ) -> None:
     recipe = load_recipe("point-robot", profile="quick", overrides=[*TINY, f"build.{asked}"])
-    with pytest.raises(
-        BuildError, match=f"task 3 asks for {re.escape(told)}, more than any machine"
-    ) as error:
+    with pytest.raises(BuildError, match=f"task 3 needs {re.escape(told)}, more than any machine") as error:
         tcmrl_data.build_dataset(
             recipe, tmp_path / "data", tasks=[3], engine="ray", address=ray_cluster.address
         )

@@ -1,1 +1,1 @@
-"""Engines run units somewhere: units in, results out; they know no dataset."""
+"""Engines run units of work in processes and return their results; they know nothing of datasets."""

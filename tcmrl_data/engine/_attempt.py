@@ -1,4 +1,4 @@
-"""One attempt at a unit: a worker process is started, fed, listened to, and ended when it is time."""
+"""Runs one attempt at a unit in a worker process."""
 
 import contextlib
 import json
@@ -17,17 +17,17 @@ from tcmrl_data.engine.base import Result, Unit
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 POLL_SECONDS = 0.1
 GRACE_SECONDS = 5.0
-"""Between asking a worker to end and killing it."""
+"""Seconds between SIGTERM and SIGKILL."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How an attempt ended; exactly one of the three is set.
+    """How an attempt ended; exactly one of the three attributes is set.
 
     Attributes:
-        digest: the unit's digest: it is done.
-        error: what the unit says is wrong; trying again will not help.
-        crash: how the worker ended without a word.
+        digest: the unit's digest, if the unit is done.
+        error: the error that the worker reported; the unit is not tried again.
+        crash: how the worker ended, if it reported no result.
     """
 
     digest: str | None = None
@@ -35,19 +35,19 @@ class Outcome:
     crash: str | None = None
 
     def result(self, unit: Unit, *, attempt: int, node: str) -> Result:
-        """The unit's result, if this was its last attempt."""
+        """The unit's result, after its last attempt."""
         return Result(unit.id, self.digest is not None, self.digest, self.error or self.crash, attempt, node)
 
 
 def run_attempt(
     unit: Unit, on_message: Callable[[Mapping[str, Any]], None], stopping: threading.Event
 ) -> Outcome:
-    """Runs a unit in a worker process of its own and waits for its end.
+    """Runs a unit in a worker process and waits for the process to end.
 
     Args:
-        unit: what to do.
-        on_message: called from another thread with every message but the last.
-        stopping: once set, the worker is ended.
+        unit: the unit.
+        on_message: called from another thread with every message except the result.
+        stopping: ends the worker when set.
     """
     with contextlib.ExitStack() as stack:
         errors = stack.enter_context(tempfile.TemporaryFile("w+", errors="replace"))
@@ -56,11 +56,11 @@ def run_attempt(
         except OSError as error:
             return Outcome(crash=f"no worker could be started: {error}")
         stack.callback(_hang_up, process)
-        stack.callback(_end, process)  # first, since a worker whose input closes drops everything
+        stack.callback(_end, process)  # before _hang_up: closed input makes a worker exit without cleanup
         last: list[Mapping[str, Any]] = []
         listener = threading.Thread(target=_listen, args=(process, on_message, last), daemon=True)
         listener.start()
-        with contextlib.suppress(BrokenPipeError):  # it died before it read; its exit code says how
+        with contextlib.suppress(BrokenPipeError):  # the worker ended early; its exit code is reported below
             assert process.stdin is not None
             process.stdin.write(json.dumps(unit.spec) + "\n")
             process.stdin.flush()
@@ -79,7 +79,7 @@ def _start_worker(unit: Unit, errors: IO[str]) -> "subprocess.Popen[str]":
         stderr=errors,
         text=True,
         env=os.environ | dict.fromkeys(THREADS, str(unit.threads)),
-        start_new_session=True,  # Ctrl-C in a terminal reaches the driver alone, which then ends its workers
+        start_new_session=True,  # Ctrl-C reaches only the driver, which then ends its workers
     )
 
 
@@ -91,7 +91,7 @@ def _listen(
     assert process.stdout is not None
     for line in process.stdout:
         if not line.endswith("\n"):
-            return  # torn by the worker's death
+            return  # the worker ended in the middle of a line
         message = json.loads(line)
         if message["kind"] == "result":
             last.append(message)
@@ -100,7 +100,7 @@ def _listen(
 
 
 def _wait(process: "subprocess.Popen[str]", timeout: float | None, stopping: threading.Event) -> str | None:
-    """Waits for the worker's end; says why, where it was ended."""
+    """Waits for the worker to end; returns the reason if this function ended it."""
     deadline = time.monotonic() + timeout if timeout is not None else float("inf")
     while True:
         try:
@@ -116,7 +116,7 @@ def _wait(process: "subprocess.Popen[str]", timeout: float | None, stopping: thr
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
-    """Asks a worker to abandon its unit, and kills it if it does not."""
+    """Sends SIGTERM to a worker, and SIGKILL if it does not end in time."""
     process.terminate()
     try:
         process.wait(GRACE_SECONDS)
@@ -126,7 +126,7 @@ def _end(process: "subprocess.Popen[str]") -> None:
 
 
 def _hang_up(process: "subprocess.Popen[str]") -> None:
-    """Closes the worker's input; what a dead worker has not read is of no use."""
+    """Closes the worker's input; data that the worker has not read are dropped."""
     assert process.stdin is not None
     with contextlib.suppress(BrokenPipeError):
         process.stdin.close()

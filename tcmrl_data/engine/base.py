@@ -1,4 +1,4 @@
-"""Engines run units somewhere, one engine a file."""
+"""Base class of engines, and the units and results that they exchange with a driver."""
 
 import abc
 from collections.abc import Callable, Generator, Mapping, Sequence
@@ -9,25 +9,25 @@ from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.plugins import Registry
 
 ATTEMPTS = 2
-"""A unit that crashed or ran out of time is tried once more; an error that it reports itself is final."""
+"""Attempts per unit that crashes or exceeds its timeout; an error that a unit reports is final."""
 
 Message = Callable[[str, Mapping[str, Any]], None]
-"""Receives (unit id, message) as units report; messages tell of progress, and may get lost."""
+"""Receives (unit id, message); messages report progress and may be lost."""
 
 
 @dataclass(frozen=True)
 class Unit:
-    """Work for one process; running it twice does no harm.
+    """Work for one process. A unit may run more than once.
 
     Attributes:
-        id: names the unit in messages and logs.
-        spec: JSON, understood by the worker.
-        worker: the module that does it, run as a process of its own; it serves by `serve`.
-        threads: of that process's libraries.
-        cost: relative length, for starting the longest first.
-        cpus: cores to reserve, on engines that know several machines.
-        gpus: graphics processors to reserve there; a fraction shares one.
-        memory: bytes to reserve there.
+        id: name of the unit in messages and logs.
+        spec: JSON values that the worker reads.
+        worker: module that the process runs; it calls `tcmrl_data.engine.worker.serve`.
+        threads: threads of the process's numerical libraries.
+        cost: relative duration; the longest unit starts first.
+        cpus: cores to reserve, on engines that use several machines.
+        gpus: GPUs to reserve on those engines; units may share one by fractions.
+        memory: bytes to reserve on those engines.
         timeout: seconds after which an attempt is ended; None for no limit.
     """
 
@@ -47,12 +47,12 @@ class Result:
     """How a unit ended.
 
     Attributes:
-        id: the unit.
-        ok: it is done.
-        digest: what the worker returned for the work done, where ok: equal work, equal digest.
-        error: one line, where not ok.
-        attempt: attempts made, from 1.
-        node: host that ran the last attempt.
+        id: the unit's id.
+        ok: True if the unit is done.
+        digest: digest of the work done, if `ok`; equal work has equal digests.
+        error: one line, if not `ok`.
+        attempt: number of attempts, at least 1.
+        node: host of the last attempt.
     """
 
     id: str
@@ -64,19 +64,19 @@ class Result:
 
 
 class BaseEngine(abc.ABC):
-    """Runs units, each at least once, in any order; a plug-in of the entry point group `tcmrl.engines`.
+    """Runs every unit at least once, in any order; a plug-in of the entry point group `tcmrl.engines`.
 
     Args:
-        workers: units at a time; as many as there is room for where None.
-        address: of the machines to work on, for engines that reach others.
+        workers: maximum number of units that run at the same time; None for as many as fit.
+        address: address of a cluster, for engines with `takes_address`.
 
     Raises:
-        BuildError: the engine takes no address.
+        BuildError: an address is given, but the engine takes none.
     """
 
     name: ClassVar[str]
     takes_address: ClassVar[bool] = False
-    """Whether the engine reaches other machines, at an address."""
+    """Whether the engine can use other machines, at an address."""
 
     def __init__(self, workers: int | None = None, *, address: str | None = None) -> None:
         if address is not None and not self.takes_address:
@@ -85,10 +85,10 @@ class BaseEngine(abc.ABC):
 
     @abc.abstractmethod
     def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
-        """Yields one result per unit as units end; closing the iterator ends what still runs.
+        """Yields one result per unit as units end; closing the generator ends the running units.
 
         Raises:
-            BuildError: a unit asks for more than any machine has; nothing was started.
+            BuildError: a unit needs more resources than any machine has; no unit was started.
         """
 
 
@@ -96,5 +96,5 @@ ENGINES = Registry("tcmrl.engines", "engine", BaseEngine)
 
 
 def longest_first(units: Sequence[Unit]) -> list[Unit]:
-    """The units in the order in which they are started: the last one to end should be a short one."""
+    """The units sorted by falling cost, so that short units fill the workers at the end."""
     return sorted(units, key=lambda unit: -unit.cost)

@@ -1,4 +1,4 @@
-"""The local engine: a supervisor with one worker process per unit."""
+"""The local engine: one worker process per unit on this machine."""
 
 import queue
 import socket
@@ -14,7 +14,7 @@ from tcmrl_data.foundation.machine import available_cores
 
 @final
 class LocalEngine(BaseEngine):
-    """Up to `workers` processes on this machine, one per core where None."""
+    """Runs up to `workers` processes on this machine; None for one per available core."""
 
     name = "local"
 

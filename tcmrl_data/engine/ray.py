@@ -1,7 +1,7 @@
-"""The Ray engine: the same worker processes, placed by a Ray cluster whose machines share the data folder.
+"""The Ray engine: worker processes on a Ray cluster whose machines share the data folder.
 
-A Ray task supervises one attempt on its machine and returns digests; data never travel through Ray. Ray tries
-a task again whose machine was lost; that may run a unit twice at once, which units are made for.
+A Ray task runs one attempt in a worker process on its machine and returns a digest; data never pass through
+Ray. If Ray loses a machine it repeats the machine's tasks, so that a unit may run twice at the same time.
 """
 
 import contextlib
@@ -20,17 +20,17 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.sizes import size
 
 LOST_RETRIES = 3
-"""How often Ray itself tries an attempt again that was lost with its machine."""
+"""How often Ray repeats an attempt whose machine was lost."""
 
 POLL_SECONDS = 0.2
 CONNECT_SECONDS = 10.0
 OBJECT_STORE_BYTES = 100_000_000
-"""For a local cluster: nothing but digests passes through, and Ray's default is a third of the memory."""
+"""Object store of a local cluster. Only digests pass through it; Ray's default is 30 % of the memory."""
 
 
 @final
 class RayEngine(BaseEngine):
-    """Works on the cluster at `address`, or on one that is started here for the build and ended with it."""
+    """Runs units on the cluster at `address`, or on a local cluster that exists only during the run."""
 
     name = "ray"
     takes_address = True
@@ -47,7 +47,7 @@ class RayEngine(BaseEngine):
 
 
 class _Run:
-    """The units of one build: those that wait, and those that Ray has."""
+    """The waiting and the running units of one call of `run`."""
 
     def __init__(self, ray: Any, units: Sequence[Unit], most_at_once: int) -> None:
         self._ray, self._most_at_once = ray, most_at_once
@@ -56,7 +56,7 @@ class _Run:
         self._mailbox = _start_mailbox(ray)
 
     def results(self, on_message: Message) -> Generator[Result, None, None]:
-        """One result per unit, as units end."""
+        """Yields one result per unit, as units end."""
         while self._waiting or self._running:
             while self._waiting and len(self._running) < self._most_at_once:
                 self._submit(*self._waiting.popleft())
@@ -72,13 +72,13 @@ class _Run:
                     yield outcome.result(unit, attempt=attempt, node=node)
 
     def stop(self) -> None:
-        """Ends what runs: first by asking, which lets workers clean up, then by force."""
+        """Cancels the running units; kills those that do not end in time."""
         ray, references = self._ray, list(self._running)
         for reference in references:
             ray.cancel(reference)
         if references:
-            _, left = ray.wait(references, num_returns=len(references), timeout=2 * GRACE_SECONDS)
-            for reference in left:
+            _, running = ray.wait(references, num_returns=len(references), timeout=2 * GRACE_SECONDS)
+            for reference in running:
                 ray.cancel(reference, force=True)
         ray.kill(self._mailbox)
 
@@ -93,7 +93,7 @@ class _Run:
         self._running[task.remote(unit, self._mailbox)] = (unit, attempt)
 
     def _outcome(self, reference: Any) -> tuple[Outcome, str]:
-        """How an attempt ended, and where."""
+        """How an attempt ended, and the name of its machine."""
         try:
             outcome, node = self._ray.get(reference)
         except self._ray.exceptions.RayError as error:
@@ -102,7 +102,7 @@ class _Run:
         return outcome, node
 
     def _messages(self) -> list[tuple[str, Mapping[str, Any]]]:
-        """What units have reported since; nothing while the mailbox is out of reach."""
+        """Messages since the last call; empty if the mailbox cannot be reached."""
         with contextlib.suppress(self._ray.exceptions.RayError):
             messages: list[tuple[str, Mapping[str, Any]]] = self._ray.get(
                 self._mailbox.take.remote(), timeout=GRACE_SECONDS
@@ -112,7 +112,7 @@ class _Run:
 
 
 class _Mailbox:
-    """Keeps messages until the driver asks for them; an actor on the driver's machine."""
+    """Stores messages until the driver takes them; a Ray actor on the driver's machine."""
 
     def __init__(self) -> None:
         self._messages: list[tuple[str, Mapping[str, Any]]] = []
@@ -122,7 +122,7 @@ class _Mailbox:
         self._messages.append((unit, message))
 
     def take(self) -> list[tuple[str, Mapping[str, Any]]]:
-        """Everything put since the last time."""
+        """Returns and forgets the stored messages."""
         messages, self._messages = self._messages, []
         return messages
 
@@ -135,7 +135,7 @@ def _start_mailbox(ray: Any) -> Any:
 
 
 def _supervise(unit: Unit, mailbox: Any) -> tuple[Outcome, str]:
-    """Runs on some machine of the cluster: one attempt, and that machine's name."""
+    """Runs one attempt on a machine of the cluster; returns its outcome and the machine's name."""
     from ray.exceptions import RayError
 
     def on_message(message: Mapping[str, Any]) -> None:
@@ -146,7 +146,7 @@ def _supervise(unit: Unit, mailbox: Any) -> tuple[Outcome, str]:
 
 
 def _import_ray() -> Any:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read on import; nothing is sent unasked
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # read on import; no usage statistics by default
     try:
         import ray
     except ImportError as error:
@@ -158,7 +158,7 @@ def _import_ray() -> Any:
 
 @contextlib.contextmanager
 def _connection(ray: Any, workers: int | None, address: str | None) -> Iterator[None]:
-    """Connects to the cluster at `address`, or starts one; a program's own connection is used as it is."""
+    """Connects to the cluster at `address`, or starts one; uses the program's connection if it has one."""
     on_sigterm, connects = signal.getsignal(signal.SIGTERM), not ray.is_initialized()
     try:
         if address is not None:
@@ -172,7 +172,7 @@ def _connection(ray: Any, workers: int | None, address: str | None) -> Iterator[
             "start one with `ray start --head`, or leave --ray-address out"
         ) from None
     if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, on_sigterm)  # Ray's own handler would end the driver without a word
+        signal.signal(signal.SIGTERM, on_sigterm)  # Ray's handler would end the driver without a message
     try:
         yield
     finally:
@@ -195,11 +195,11 @@ def _connect(ray: Any, workers: int | None, address: str | None) -> None:
 
 
 def _knock(address: str) -> None:
-    """Fails at once where nobody listens; Ray itself would try for minutes.
+    """Checks at once that a server listens at the address; Ray would try for minutes.
 
     Raises:
         OSError: no connection.
-        ValueError: not HOST:PORT.
+        ValueError: the address is not HOST:PORT.
     """
     if address != "auto":
         host, _, port = address.rpartition("://")[2].rpartition(":")
@@ -207,19 +207,19 @@ def _knock(address: str) -> None:
 
 
 def _refuse_unplaceable(nodes: Sequence[Mapping[str, Any]], units: Sequence[Unit]) -> None:
-    """Refuses a unit that is too large for every machine, which would wait for ever.
+    """Checks that some machine can hold every unit; Ray would wait for ever for a larger one.
 
     Raises:
-        BuildError: names the unit, what it asks for, and what machines there are.
+        BuildError: names the unit, the resources that it needs, and the machines.
     """
     machines = [node["Resources"] for node in nodes if node["Alive"]]
     for unit in units:
-        wanted = {"CPU": unit.cpus, "GPU": unit.gpus, "memory": unit.memory}
-        if not any(all(each.get(name, 0) >= wanted[name] for name in wanted) for each in machines):
-            there = "; ".join(sorted({_resources(each) for each in machines}))
+        needed = {"CPU": unit.cpus, "GPU": unit.gpus, "memory": unit.memory}
+        if not any(all(machine.get(name, 0) >= needed[name] for name in needed) for machine in machines):
+            present = "; ".join(sorted({_resources(machine) for machine in machines}))
             raise BuildError(
-                f"{unit.id} asks for {_resources(wanted)}, more than any machine of the cluster has "
-                f"({there}); lower build.cpus, build.gpus or build.memory with --set, or add a machine"
+                f"{unit.id} needs {_resources(needed)}, more than any machine of the cluster has "
+                f"({present}); lower build.cpus, build.gpus or build.memory with --set, or add a machine"
             )
 
 

@@ -1,9 +1,9 @@
-"""The worker's side of a unit's process: a JSON spec on standard input, messages on standard output.
+"""The worker process of a unit: reads a JSON spec from standard input, writes messages to standard output.
 
-A module becomes a worker by calling `serve`; engines run it as `python -m <module>`. Messages go to standard
-output as JSON lines, the last one `{"kind": "result", "digest" | "error"}`.
-The process ends when standard input closes, so that a killed driver leaves no orphan. On SIGTERM it abandons
-the unit: what it published stands, what it had staged is removed.
+A module becomes a worker by calling `serve`; engines run it as `python -m <module>`. Messages are JSON lines;
+the last one is `{"kind": "result", "digest" | "error"}`. The process ends when standard input closes, so that
+no worker outlives a killed driver. On SIGTERM it abandons the unit: published parts stay, staged files are
+removed.
 """
 
 import json
@@ -21,15 +21,15 @@ from tcmrl_data.foundation.errors import TcmrlError
 REPORT_SECONDS = 0.5
 
 Send = Callable[[Mapping[str, Any]], None]
-"""Receives a unit's messages; each has a `kind`, and those of kind `steps` a `count` to add up."""
+"""Receives a unit's messages. A message has a `kind`; messages of kind `steps` have a `count` to add up."""
 
 
 class _Reporter:
-    """Writes messages as JSON lines; step counts are gathered so that they cost nothing."""
+    """Writes messages as JSON lines; step counts are added up and written twice a second."""
 
     def __init__(self) -> None:
         self._output = os.fdopen(os.dup(1), "w")
-        os.dup2(2, 1)  # a library that prints must not break the message stream
+        os.dup2(2, 1)  # the output of a library's print must not mix with messages
         self._steps, self._sent = 0, time.monotonic()
 
     def __call__(self, message: Mapping[str, Any]) -> None:
@@ -49,22 +49,22 @@ class _Reporter:
 
 
 def _end_with_the_driver() -> None:
-    while os.read(0, 4096):  # not sys.stdin: its lock, held here, would abort the interpreter's own end
+    while os.read(0, 4096):  # not sys.stdin: holding its lock would abort the interpreter's shutdown
         pass
     os._exit(1)
 
 
 def _abandon(signal_number: int, frame: FrameType | None) -> None:
-    signal.signal(signal_number, signal.SIG_IGN)  # asked again, it goes on cleaning up
+    signal.signal(signal_number, signal.SIG_IGN)  # a second signal must not interrupt the cleanup
     raise SystemExit(128 + signal_number)
 
 
 def serve(work: Callable[[dict[str, Any], Send], str]) -> None:
-    """Makes this process a worker: does the unit whose spec is the first line of standard input.
+    """Runs the unit whose spec is the first line of standard input, reports its result and ends the process.
 
     Args:
-        work: from a spec and a receiver of messages to the digest of what was done; what it raises as
-            `TcmrlError` is the unit's error and is not tried again.
+        work: takes a spec and a receiver of messages, and returns the digest of the work done. A `TcmrlError`
+            that it raises becomes the unit's error; the unit is not tried again.
     """
     signal.signal(signal.SIGTERM, _abandon)
     spec = json.loads(sys.stdin.readline())
@@ -75,4 +75,4 @@ def serve(work: Callable[[dict[str, Any], Send], str]) -> None:
     except TcmrlError as error:
         report({"kind": "result", "error": str(error)})
     sys.stderr.flush()
-    os._exit(0)  # all is written and told; taking the libraries down in order would take a second
+    os._exit(0)  # skips the shutdown of libraries, which takes a second
