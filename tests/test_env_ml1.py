@@ -93,7 +93,7 @@ def test_expert_noise_is_scaled_and_added_per_action() -> None:
 
 
 def test_a_task_of_another_set_is_refused() -> None:
-    with pytest.raises(TaskError, match="'reach-v3' is no task of this environment"):
+    with pytest.raises(TaskError, match="'reach-v3' does not belong to this environment"):
         environment_of("ml1/door-close").make(parameters_of("ml1/reach")[0])
 
 

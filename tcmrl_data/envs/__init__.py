@@ -1,1 +1,1 @@
-"""Environment families, one a file; plug-ins of the entry point group `tcmrl.environments`."""
+"""Environment families, one per file; plug-ins of the entry point group `tcmrl.environments`."""

@@ -1,4 +1,4 @@
-"""What the families simulated by MuJoCo share: a task cut off at its horizon, and a physics fingerprint."""
+"""Base class of tasks simulated by MuJoCo, and the fingerprint of their physics."""
 
 import abc
 import hashlib
@@ -12,10 +12,10 @@ from tcmrl_data.envs.trajectory import FloatArray
 
 
 class SimulatedTask(gymnasium.Env[FloatArray, FloatArray]):
-    """One task: a simulator from another library under this project's rules.
+    """One task, run by a simulator of another library.
 
-    Actions are clipped to [-1, 1], episodes are truncated at the horizon, and an episode depends on the
-    reset's seed and the actions alone, not on earlier episodes.
+    Actions are clipped to [-1, 1] and episodes are truncated at the horizon. An episode depends only on the
+    seed of its reset and its actions, not on earlier episodes.
     """
 
     def __init__(
@@ -47,15 +47,15 @@ class SimulatedTask(gymnasium.Env[FloatArray, FloatArray]):
         self._simulator.close()
 
     def observe(self, observation: FloatArray) -> FloatArray:
-        """What the task shows of the simulator's observation (observation_dim,)."""
+        """The task's observation for the simulator's observation, both (observation_dim,)."""
         return observation
 
     @abc.abstractmethod
     def reward(self, action: FloatArray, simulator_reward: float, info: dict[str, Any]) -> float:
-        """The task's reward for an executed action (action_dim,) and what the simulator says of the step."""
+        """The task's reward for an executed action (action_dim,), given the simulator's reward and info."""
 
     def extras(self, info: dict[str, Any]) -> dict[str, Any]:
-        """The environment's extra values of a step."""
+        """The extra values of a step, given the simulator's info."""
         return {}
 
 
@@ -65,15 +65,15 @@ def squared_norm(action: FloatArray) -> float:
 
 
 def simulation_fingerprint(simulator: Any, *packages: str) -> dict[str, Any]:
-    """What the dynamics of a simulator depend on beside the task.
+    """Everything other than the task that a simulator's dynamics depend on.
 
     Args:
-        simulator: a Gymnasium MuJoCo environment, before any task is applied to its model.
-        packages: distributions whose code takes part, beside mujoco and gymnasium.
+        simulator: a Gymnasium MuJoCo environment, before a task is applied to its model.
+        packages: distributions that define the dynamics, in addition to mujoco and gymnasium.
 
     Returns:
-        JSON values: seconds per physics step and per action, steps per action, sha256 of the compiled
-        model in MuJoCo's binary format, and versions.
+        JSON values: seconds per physics step and per action, physics steps per action, sha256 of the compiled
+        model in MuJoCo's binary format, and package versions.
     """
     import mujoco
 

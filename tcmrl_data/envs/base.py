@@ -1,4 +1,4 @@
-"""What an environment is: settings, task parameters, a Gymnasium environment, and lanes stepped together."""
+"""Base classes of environments and of their settings, and lanes, which step several episodes together."""
 
 import abc
 import importlib.resources
@@ -21,7 +21,7 @@ Parameters = Mapping[str, Any]
 """JSON values that define one task."""
 
 Reward = Literal["stored", "dense"]
-"""`stored`: what the dataset holds. `dense`: shaped, where the stored reward is sparse."""
+"""`stored`: the reward in the dataset. `dense`: the shaped reward, if the stored reward is sparse."""
 
 
 class EnvironmentSettings(BaseModel):
@@ -29,11 +29,11 @@ class EnvironmentSettings(BaseModel):
 
     Attributes:
         name: the environment's name.
-        task_seed: seeds task parameters and split; independent of a build's `--seed`.
-        tasks: size of the full task set.
-        train: how many of them are training tasks.
+        task_seed: seed of the task parameters and of the split; independent of a build's `--seed`.
+        tasks: number of tasks.
+        train: number of training tasks.
         horizon: steps after which an episode is truncated.
-        reward_density: `sparse` where few steps carry reward (paper, Appendix F.3).
+        reward_density: `sparse` if few steps have a reward (paper, Appendix F.3).
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -54,14 +54,14 @@ class EnvironmentSettings(BaseModel):
 
 @dataclass(frozen=True)
 class LaneStep:
-    """One step of all lanes; rows of inactive lanes repeat the last observation with zero reward.
+    """One step of all lanes; rows of inactive lanes repeat the last observation and have reward zero.
 
     Attributes:
         observations: (lanes, observation_dim), full view.
         rewards: (lanes,).
         terminated: (lanes,) bool.
         truncated: (lanes,) bool.
-        extras: per-lane values of the environment's extra arrays, each (lanes,).
+        extras: the environment's extra arrays by name, all of shape (lanes,).
     """
 
     observations: FloatArray
@@ -72,17 +72,17 @@ class LaneStep:
 
 
 class Lanes(abc.ABC):
-    """Episodes stepped together, each lane with its own task."""
+    """Several episodes stepped together; every lane has its own task."""
 
     num_lanes: int
 
     @abc.abstractmethod
     def reset(self, seeds: Sequence[int]) -> FloatArray:
-        """Starts one episode per lane; full observations (lanes, observation_dim)."""
+        """Starts one episode per lane; returns full observations (lanes, observation_dim)."""
 
     @abc.abstractmethod
     def reset_lane(self, lane: int, seed: int) -> FloatArray:
-        """Starts a new episode in one lane, the others go on; its full observation (observation_dim,)."""
+        """Starts a new episode in one lane only; returns its full observation (observation_dim,)."""
 
     @abc.abstractmethod
     def step(self, actions: FloatArray, active: BoolArray) -> LaneStep:
@@ -90,25 +90,25 @@ class Lanes(abc.ABC):
 
     @abc.abstractmethod
     def close(self) -> None:
-        """Frees what the lanes hold."""
+        """Frees the simulators."""
 
 
 class Environment(abc.ABC):
-    """A family of tasks with one state and action space.
+    """A family of tasks with the same state and action space.
 
-    Subclasses set the class attributes and are final; nothing heavy (mujoco, metaworld) is imported
-    before a task is made. They are plug-ins of the entry point group `tcmrl.environments`.
+    A subclass is final, sets the class attributes and is a plug-in of the entry point group
+    `tcmrl.environments`. It imports simulators (mujoco, metaworld) only when it makes a task.
     """
 
     name: str
-    """On the class, the plug-in's name; on an instance, the environment's, such as `ml1/reach`."""
+    """The plug-in's name on the class; the environment's name, such as `ml1/reach`, on an instance."""
     Settings: ClassVar[type[EnvironmentSettings]] = EnvironmentSettings
     observation_dim: int
     action_dim: int
     extras: ClassVar[Mapping[str, type[np.generic]]] = {}
-    """Per-step arrays beside the standard ones, name to dtype."""
+    """Dtypes of further per-step arrays, by name."""
     simulator_bytes: ClassVar[int] = 0
-    """Memory of one simulated task, as measured; 0 where a task is a handful of numbers."""
+    """Measured memory of one simulated task; 0 for tasks without a simulator."""
 
     def __init__(self, settings: EnvironmentSettings) -> None:
         self.settings = settings
@@ -116,60 +116,64 @@ class Environment(abc.ABC):
 
     @classmethod
     def members(cls) -> list[str]:
-        """Names of the environments of this class: one, or `<plug-in>/<member>` for a family of several."""
+        """The environments of this class: the plug-in's name, or several names `<plug-in>/<member>`."""
         return [cls.name]
 
     @classmethod
     def recipe_file(cls, name: str) -> Traversable:
-        """The recipe, a TOML file, of the environment `name`; a package of its own brings its own file."""
+        """The TOML recipe of the environment `name`; plug-ins of other packages override this method."""
         return importlib.resources.files("tcmrl_manifests") / f"{name.partition('/')[0]}.toml"
 
     @abc.abstractmethod
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
-        """Parameters of all tasks, drawn once as the field's code draws them; JSON values."""
+        """Draws the parameters of all tasks as the published code does; JSON values."""
 
     @abc.abstractmethod
     def make(
         self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> gymnasium.Env[Any, Any]:
-        """One task as a Gymnasium environment: actions in [-1, 1], truncated at the horizon.
+        """Makes one task as a Gymnasium environment with actions in [-1, 1], truncated at the horizon.
 
         Args:
-            parameters: the task.
-            view: observations to show.
-            reward: `dense` for the shaped reward of an environment whose stored reward is sparse;
-                the same as `stored` elsewhere.
+            parameters: the task's parameters.
+            view: which observations the environment returns.
+            reward: `dense` for the shaped reward; equals `stored` if the stored reward is dense.
         """
 
     def lanes(self, parameters: Sequence[Parameters], *, reward: Reward = "stored") -> Lanes:
-        """One lane per entry: full view, `reward` as for `make`."""
+        """Lanes with the full view, one per entry of `parameters`; `reward` as for `make`."""
         return EnvironmentLanes(self, parameters, reward)
 
     def stored_view(self, observations: FloatArray) -> FloatArray:
-        """Hides what the task hides from full observations (..., observation_dim)."""
+        """The stored view of full observations (..., observation_dim)."""
         return observations
 
     def oracle(self, parameters: Sequence[Parameters]) -> Controller | None:
-        """A controller that knows each lane's task, where one can be computed."""
+        """A controller that knows the lanes' tasks; None if there is none."""
         return None
 
     def scripted(self, parameters: Sequence[Parameters], noise: float) -> Controller | None:
-        """The environment's expert for each lane plus N(0, noise) per action, where one exists."""
+        """The environment's expert for every lane, with N(0, noise) added to actions; None if there is none.
+
+        Args:
+            parameters: the lanes' tasks.
+            noise: standard deviation of the noise.
+        """
         return None
 
     def fingerprint(self) -> dict[str, Any]:
-        """What the dynamics depend on beside the parameters: library versions, dt, model hash; JSON."""
+        """Library versions, time step, model hash and anything else that the dynamics depend on; JSON."""
         return {}
 
 
 @final
 class EnvironmentLanes(Lanes):
-    """Lanes over single Gymnasium environments, stepped one after another."""
+    """Lanes that step Gymnasium environments one after another."""
 
     def __init__(self, environment: Environment, parameters: Sequence[Parameters], reward: Reward) -> None:
         self.num_lanes = len(parameters)
         self._extras = environment.extras
-        self._environments = [environment.make(each, view="full", reward=reward) for each in parameters]
+        self._environments = [environment.make(task, view="full", reward=reward) for task in parameters]
         self._observations = np.zeros((self.num_lanes, environment.observation_dim))
 
     def reset(self, seeds: Sequence[int]) -> FloatArray:
@@ -200,7 +204,7 @@ class EnvironmentLanes(Lanes):
 
 @final
 class EnvironmentRegistry(Registry[Environment]):
-    """Environments by name; a plug-in may be a family of several."""
+    """Environments by name; one plug-in may provide several environments."""
 
     def get(self, name: str) -> type[Environment]:
         family = super().get(name.partition("/")[0])
@@ -210,11 +214,11 @@ class EnvironmentRegistry(Registry[Environment]):
 
     def defect(self, found: Any, name: str) -> str | None:
         defect = super().defect(found, name)
-        strangers = [] if defect else [each for each in found.members() if each.partition("/")[0] != name]
-        return f"has the member {strangers[0]!r} outside {name!r}" if strangers else defect
+        foreign = [] if defect else [item for item in found.members() if item.partition("/")[0] != name]
+        return f"has the member {foreign[0]!r} outside {name!r}" if foreign else defect
 
     def members(self) -> list[str]:
-        """The environments of all plug-ins that are not broken, sorted; imports the plug-ins."""
+        """The environments of all working plug-ins, sorted; imports the plug-ins."""
         return sorted(name for family in self.working().values() for name in family.members())
 
 
@@ -222,6 +226,11 @@ ENVIRONMENTS = EnvironmentRegistry("tcmrl.environments", "environment", Environm
 
 
 def make_environment(settings: Mapping[str, Any]) -> Environment:
-    """The environment of a validated `[environment]` table (raises pydantic's error for a bad one)."""
+    """The environment of an `[environment]` table.
+
+    Raises:
+        UnknownNameError: there is no such environment.
+        ValidationError: pydantic's, if the table is not valid.
+    """
     kind = ENVIRONMENTS.get(settings["name"])
     return kind(kind.Settings.model_validate_json(json.dumps(settings)))

@@ -1,4 +1,4 @@
-"""What acts in an environment: a batch of lanes, told of every step that it takes."""
+"""Base class of controllers, which choose the actions of a batch of lanes."""
 
 import abc
 from dataclasses import dataclass
@@ -9,23 +9,23 @@ import numpy as np
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 
 View = Literal["stored", "full"]
-"""`stored`: what the dataset holds and the meta-learner sees. `full`: with what the task hides too."""
+"""`stored`: observations in the dataset, for the meta-learner. `full`: includes values hidden by the task."""
 
 
 @dataclass(frozen=True)
 class Transition:
-    """One step of all lanes, with observations in the view of the controller that took it.
+    """One step of all lanes, with observations in the controller's view.
 
-    Rows of lanes that are not active repeat the last observation, with zero reward.
+    Rows of inactive lanes repeat the last observation and have reward zero.
 
     Attributes:
         observations: (lanes, observation_dim), before the step.
         actions: (lanes, action_dim) float32 in [-1, 1], as executed.
-        rewards: (lanes,), of the state after the move.
+        rewards: (lanes,), for the state after the step.
         next_observations: (lanes, observation_dim), after the step.
-        terminated: (lanes,) bool; True only where the task itself ended the episode.
-        truncated: (lanes,) bool; True where a time limit ended it.
-        active: (lanes,) bool; False where the lane's episode had ended before this step.
+        terminated: (lanes,) bool; True if the task ended the episode.
+        truncated: (lanes,) bool; True if a time limit ended the episode.
+        active: (lanes,) bool; False if the lane's episode ended before this step.
     """
 
     observations: FloatArray
@@ -38,16 +38,16 @@ class Transition:
 
 
 class Controller(abc.ABC):
-    """Acts for a batch of lanes; rollouts use this interface of every policy.
+    """Chooses actions for a batch of lanes; the interface of all policies in rollouts.
 
-    A controller that keeps state acts for one rollout: one episode in every lane.
+    A controller with state serves one rollout, which is one episode in every lane.
     """
 
     view: View = "stored"
-    """Which observations the controller is given."""
+    """Which observations the controller receives."""
 
     def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
-        """Noise of one episode, (num_steps, action_dim) float32; standard normal unless overridden."""
+        """Draws the noise of one episode, (num_steps, action_dim) float32; standard normal by default."""
         return generator.standard_normal((num_steps, action_dim), dtype=np.float32)
 
     @abc.abstractmethod
@@ -55,7 +55,7 @@ class Controller(abc.ABC):
         """Actions (lanes, action_dim) for observations (lanes, observation_dim) and this step's noise."""
 
     def observe(self, transition: Transition) -> None:
-        """Receives every step after it was taken; does nothing unless overridden.
+        """Receives every step after it is executed; does nothing by default.
 
         For controllers that adapt within an episode. `tcmrl_data.Recorder` turns transitions into
         trajectories.

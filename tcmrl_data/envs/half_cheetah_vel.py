@@ -1,8 +1,9 @@
 """Half-Cheetah-Vel: a planar cheetah runs at a target velocity.
 
-Definition as in MAML, PEARL and FOCAL, on Gymnasium's HalfCheetah-v5 model: reward
--|v - v*| - 0.05 |a|^2 with v the torso's forward velocity over the step, dt 0.05, no termination.
-Observations are Gymnasium's, 17 values without the absolute x; FOCAL and CSRO add the torso's position.
+The definition follows MAML, PEARL and FOCAL, with Gymnasium's HalfCheetah-v5 model: the reward is
+-|v - v*| - 0.05 |a|^2, where v is the torso's forward velocity over the step; dt is 0.05; episodes do not
+terminate. Observations are Gymnasium's, 17 values without the absolute x; FOCAL and CSRO add the torso's
+position.
 """
 
 from typing import Any, final
@@ -50,9 +51,9 @@ class HalfCheetahVel(Environment):
     settings: HalfCheetahVelSettings
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
-        random = np.random.RandomState(task_seed)  # the field's generator
+        random = np.random.RandomState(task_seed)  # the published code's generator
         low, high = self.settings.min_velocity, self.settings.max_velocity
-        return [{"velocity": float(each)} for each in random.uniform(low, high, num_tasks)]
+        return [{"velocity": float(velocity)} for velocity in random.uniform(low, high, num_tasks)]
 
     def make(
         self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"

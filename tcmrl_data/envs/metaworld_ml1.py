@@ -1,9 +1,9 @@
-"""Meta-World ML1: one manipulation task set each, fifty hidden goals and object positions.
+"""Meta-World ML1: manipulation task sets with hidden goals and object positions.
 
 `ml1/<task-set>` is Meta-World's `<task-set>-v3` (the paper's names end in -v2). A task is one of the fifty
-`ML1(<task-set>-v3, seed=task_seed).train_tasks`, defined by its random vector. The goal is the last three of
-the 39 observation values: policies may see it (view `full`), storage and the meta-learner see zeros.
-Reward and dynamics do not depend on what is shown.
+`ML1(<task-set>-v3, seed=task_seed).train_tasks`, defined by its random vector. The last three of the 39
+observation values are the goal: the view `full` contains it, the view `stored` contains zeros instead.
+Reward and dynamics do not depend on the view.
 """
 
 import functools
@@ -35,14 +35,14 @@ TASK_SETS = (
     "reach", "reach-wall", "shelf-place", "soccer", "stick-pull", "stick-push", "sweep", "sweep-into",
     "window-close", "window-open",
 )  # fmt: skip
-"""The task sets, spelled out so that listing environments does not import Meta-World."""
+"""The names of the task sets; a literal, so that listing environments does not import Meta-World."""
 
 
 class MetaWorldML1Settings(EnvironmentSettings):
     """Settings of ML1.
 
     Attributes:
-        tasks: at most the fifty training tasks that ML1 draws per task set.
+        tasks: number of tasks, at most the 50 training tasks that ML1 draws.
     """
 
     tasks: int = Field(ge=3, le=TASKS_PER_SET)
@@ -50,7 +50,7 @@ class MetaWorldML1Settings(EnvironmentSettings):
 
 @final
 class MetaWorldML1(Environment):
-    """One ML1 task set; episodes end at the horizon only; `success` is Meta-World's, per step."""
+    """One ML1 task set; episodes end only at the horizon; `success` is Meta-World's value per step."""
 
     name = "ml1"
     Settings = MetaWorldML1Settings
@@ -70,8 +70,8 @@ class MetaWorldML1(Environment):
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         vectors = _random_vectors(self._env_name, task_seed)[:num_tasks]
         return [
-            {"env_name": self._env_name, "rand_vec": list(each), "partially_observable": True}
-            for each in vectors
+            {"env_name": self._env_name, "rand_vec": list(vector), "partially_observable": True}
+            for vector in vectors
         ]
 
     def make(
@@ -79,7 +79,7 @@ class MetaWorldML1(Environment):
     ) -> "MetaWorldML1Task":
         if parameters["env_name"] != self._env_name:
             raise TaskError(
-                f"{self.name}: a task of {parameters['env_name']!r} is no task of this environment"
+                f"{self.name}: a task of {parameters['env_name']!r} does not belong to this environment"
             )
         return MetaWorldML1Task(parameters, view=view, horizon=self.settings.horizon)
 
@@ -89,7 +89,7 @@ class MetaWorldML1(Environment):
         return hidden
 
     def scripted(self, parameters: Sequence[Parameters], noise: float) -> "ExpertController":
-        return ExpertController([each["env_name"] for each in parameters], noise)
+        return ExpertController([task["env_name"] for task in parameters], noise)
 
     def fingerprint(self) -> dict[str, Any]:
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
@@ -103,13 +103,13 @@ class MetaWorldML1(Environment):
 
 @functools.cache
 def _random_vectors(env_name: str, task_seed: int) -> tuple[tuple[float, ...], ...]:
-    """The random vectors of ML1's training tasks; constructing ML1 resets a simulator 100 times."""
+    """The random vectors of ML1's training tasks; cached, because making ML1 resets a simulator 100 times."""
     import metaworld
 
     benchmark: Any = metaworld.ML1
-    # the pickles are Meta-World's own, made in this process a moment ago
+    # these pickles are safe: Meta-World makes them in this process
     drawn = [pickle.loads(task.data) for task in benchmark(env_name, seed=task_seed).train_tasks]
-    return tuple(tuple(float(value) for value in each["rand_vec"]) for each in drawn)
+    return tuple(tuple(float(value) for value in task["rand_vec"]) for task in drawn)
 
 
 @final
@@ -139,25 +139,25 @@ class MetaWorldML1Task(SimulatedTask):
 
 
 def _simulator(parameters: Parameters, horizon: int) -> gymnasium.Env[Any, Any]:
-    """Meta-World's environment of a task, goal shown, without constructing the benchmark again."""
+    """Meta-World's environment of a task with a visible goal, made without the slow benchmark object."""
     from metaworld.env_dict import ALL_V3_ENVIRONMENTS
     from metaworld.types import Task
 
     kind = ALL_V3_ENVIRONMENTS[parameters["env_name"]]
     task = {"env_cls": kind, "rand_vec": np.array(parameters["rand_vec"]), "partially_observable": False}
     simulator = kind()
-    simulator.max_path_length = max(simulator.max_path_length, horizon)  # it raises past its own limit
+    simulator.max_path_length = max(simulator.max_path_length, horizon)  # a step beyond it raises an error
     simulator.set_task(Task(parameters["env_name"], pickle.dumps(task)))
     return simulator
 
 
 @final
 class ExpertController(Controller):
-    """Meta-World's scripted experts, one per lane, plus N(0, noise) on every action, clipped to [-1, 1].
+    """Meta-World's scripted experts, one per lane; adds N(0, noise) to actions and clips them to [-1, 1].
 
     Args:
-        env_names: Meta-World's environment name per lane.
-        noise: standard deviation (published data: 0.1).
+        env_names: name of Meta-World's environment, per lane.
+        noise: standard deviation of the noise (published data: 0.1).
     """
 
     view: View = "full"
@@ -171,7 +171,7 @@ class ExpertController(Controller):
 
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         with warnings.catch_warnings():
-            # experts ask for more than a full step on purpose, and warn of it at every step
+            # experts exceed the action limits on purpose, and Meta-World warns at every step
             warnings.filterwarnings("ignore", message="Constant")
             actions = np.stack(
                 [

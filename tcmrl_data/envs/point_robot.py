@@ -1,7 +1,7 @@
-"""Point robots in the plane: a goal on the half circle (dense or sparse reward), or a wind to resist.
+"""Point robots in the plane, with a goal on the half circle (dense or sparse reward) or with a wind.
 
-Definitions follow the field's code (PEARL, FOCAL, IDAQ); the robot starts at the origin and an action
-moves it by at most 0.1 per axis.
+The definitions follow the published code of PEARL, FOCAL and IDAQ. The robot starts at the origin, and an
+action moves it by at most 0.1 per axis.
 """
 
 from collections.abc import Sequence
@@ -22,10 +22,10 @@ class PointRobotSettings(EnvironmentSettings):
     """Settings of the point robots.
 
     Attributes:
-        goal_radius: distance within which the sparse reward is paid (published code: 0.2).
-        sparse_reward: `distance` pays 1 - dist inside the radius (paper, Appendix D),
-            `normalized` pays 1 - dist / radius (published code).
-        wind_limit: wind is uniform in [-limit, limit] per axis (published code: 0.05).
+        goal_radius: largest distance with a sparse reward (published code: 0.2).
+        sparse_reward: the reward inside the radius is 1 - dist with `distance` (paper, Appendix D) and
+            1 - dist / radius with `normalized` (published code).
+        wind_limit: the wind is uniform in [-limit, limit] per axis (published code: 0.05).
     """
 
     goal_radius: float = Field(default=0.2, gt=0)
@@ -34,7 +34,7 @@ class PointRobotSettings(EnvironmentSettings):
 
 
 class _PointRobot(Environment):
-    """What the three point robots share: planar motion, stepped as one NumPy batch."""
+    """Base class of the point robots: planar motion, stepped as one NumPy batch."""
 
     Settings = PointRobotSettings
     observation_dim = 2
@@ -42,7 +42,7 @@ class _PointRobot(Environment):
     settings: PointRobotSettings
 
     def rewards(self, distances: FloatArray, reward: Reward) -> FloatArray:
-        """Rewards (...,) for distances to the goal (...,) after the move."""
+        """Rewards (...) for distances (...) to the goal after the step."""
         return -distances
 
     def make(
@@ -59,7 +59,7 @@ class _PointRobot(Environment):
 
 @final
 class PointRobot(_PointRobot):
-    """Goals spread over the half circle, dense reward -dist."""
+    """Goals evenly spaced on the half circle; dense reward -dist."""
 
     name = "point-robot"
 
@@ -69,7 +69,7 @@ class PointRobot(_PointRobot):
 
 @final
 class SparsePointRobot(_PointRobot):
-    """Goals spread over the half circle, reward only near the goal."""
+    """Goals evenly spaced on the half circle; a reward only near the goal."""
 
     name = "sparse-point-robot"
 
@@ -86,12 +86,12 @@ class SparsePointRobot(_PointRobot):
 
 @final
 class PointRobotWind(_PointRobot):
-    """One goal at (1, 0); each task has a wind that shifts every step."""
+    """One goal at (1, 0); a task has a constant wind, which is added to every step."""
 
     name = "point-robot-wind"
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
-        random = np.random.RandomState(task_seed)  # the field's generator: all x first, then all y
+        random = np.random.RandomState(task_seed)  # as the published code: all x first, then all y
         limit = self.settings.wind_limit
         winds = [random.uniform(-limit, limit, num_tasks) for _ in range(2)]
         return [{"goal": [1.0, 0.0], "wind": [float(x), float(y)]} for x, y in zip(*winds, strict=True)]
@@ -104,16 +104,16 @@ def half_circle_goals(num_tasks: int) -> list[dict[str, Any]]:
 
 
 def goals_and_winds(parameters: Sequence[Parameters]) -> tuple[FloatArray, FloatArray]:
-    """Goals and winds of several tasks, each (tasks, 2)."""
+    """Goals (tasks, 2) and winds (tasks, 2) of several tasks."""
     return (
-        np.array([each["goal"] for each in parameters], dtype=np.float64),
-        np.array([each["wind"] for each in parameters], dtype=np.float64),
+        np.array([task["goal"] for task in parameters], dtype=np.float64),
+        np.array([task["wind"] for task in parameters], dtype=np.float64),
     )
 
 
 @final
 class GreedyController(Controller):
-    """Moves each axis as far towards the goal as one step allows, wind included; needs no noise."""
+    """Moves towards the goal as far as one step allows on every axis, and compensates the wind; no noise."""
 
     def __init__(self, goals: FloatArray, winds: FloatArray) -> None:
         self._targets = goals - winds
@@ -124,7 +124,7 @@ class GreedyController(Controller):
 
 @final
 class PointRobotLanes(Lanes):
-    """Any number of point robots as one NumPy batch."""
+    """Point robots stepped as one NumPy batch."""
 
     def __init__(self, environment: _PointRobot, parameters: Sequence[Parameters], reward: Reward) -> None:
         self.num_lanes = len(parameters)
@@ -158,7 +158,7 @@ class PointRobotLanes(Lanes):
 
 @final
 class PointRobotEnv(gymnasium.Env[FloatArray, FloatArray]):
-    """One lane under Gymnasium's interface."""
+    """One lane with Gymnasium's interface."""
 
     observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)

@@ -1,14 +1,15 @@
-"""Hopper- and Walker-Rand-Params: run forward with a body whose physics differ from task to task.
+"""Hopper- and Walker-Rand-Params: run forward with a body whose physics depend on the task.
 
 A task multiplies every element of the nominal body masses, inertias, joint dampings and friction
 coefficients by base^U(-3, 3). The models are Gymnasium's Hopper-v5 and Walker2d-v5 (both feet of the walker
-with friction 1.9), which differ from the field's older models in two points that the settings decide:
+have friction 1.9). Two settings concern differences from the older models of the published code:
 
-- Physics step. The older models act for 4 steps of 0.004 s, Gymnasium's for 4 of 0.002 s. The default is
-  0.004 s: horizon and published returns belong to it, and random actions stayed finite in all tasks.
-- Derived constants. MuJoCo keeps quantities computed from masses (inverse weights, which set how stiff
-  contacts and joint limits are). The default has `mj_setConst` recompute them for the scaled body; the
-  published code leaves those of the nominal one.
+- Physics step. An action lasts 4 steps of 0.004 s in the older models and 4 steps of 0.002 s in Gymnasium's.
+  The default is 0.004 s: the horizon and the published returns belong to it, and with random actions all
+  tasks stayed finite.
+- Derived constants. MuJoCo stores quantities computed from masses (inverse weights, which set the stiffness
+  of contacts and joint limits). By default `mj_setConst` recomputes them for the scaled body; the published
+  code keeps the values of the nominal body.
 """
 
 import abc
@@ -35,9 +36,10 @@ class RandParamsSettings(EnvironmentSettings):
         multiplier_base: base of the multipliers of mass, inertia and friction (paper, Appendix D: 1.5).
         damping_base: base of the damping multipliers (paper, Appendix D: 1.5; published code: 1.3).
         log_scale_limit: exponents are uniform in [-limit, limit] (paper, Appendix D: 3).
-        timestep: seconds per physics step; an action lasts four (published code's models: 0.004,
+        timestep: seconds per physics step; an action lasts four steps (models of the published code: 0.004,
             Gymnasium's: 0.002).
-        constants: `recomputed` by mj_setConst after scaling, or `nominal` as in the published code.
+        constants: derived constants, `recomputed` by mj_setConst after scaling, or `nominal` as in the
+            published code.
     """
 
     multiplier_base: float = Field(default=1.5, gt=1)
@@ -48,14 +50,14 @@ class RandParamsSettings(EnvironmentSettings):
 
 
 class _RandParams(Environment):
-    """What both robots share; `shapes` are those of the model's arrays, in the field's drawing order."""
+    """Base class of both robots; `shapes` lists the scaled model arrays in the order of drawing."""
 
     Settings = RandParamsSettings
     settings: RandParamsSettings
     shapes: ClassVar[Mapping[str, tuple[int, ...]]]
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
-        random = np.random.RandomState(task_seed)  # the field's generator
+        random = np.random.RandomState(task_seed)  # the published code's generator
         return [self._draw(random) for _ in range(num_tasks)]
 
     def _draw(self, random: np.random.RandomState) -> dict[str, Any]:
@@ -101,12 +103,12 @@ class _RandParams(Environment):
 
     @abc.abstractmethod
     def simulator(self) -> Any:
-        """Gymnasium's environment with the nominal body."""
+        """Makes Gymnasium's environment with the nominal body."""
 
 
 @final
 class HopperRandParams(_RandParams):
-    """One leg; ends when the torso is not above 0.7 m or leans 0.2 rad or more."""
+    """One leg; terminates unless the torso is above 0.7 m and leans by less than 0.2 rad."""
 
     name = "hopper-rand-params"
     observation_dim = 11
@@ -127,7 +129,7 @@ class HopperRandParams(_RandParams):
 
 @final
 class WalkerRandParams(_RandParams):
-    """Two legs; ends when the torso leaves heights (0.8, 2) m or leans 1 rad or more."""
+    """Two legs; terminates unless the torso's height is in (0.8, 2) m and it leans by less than 1 rad."""
 
     name = "walker-rand-params"
     observation_dim = 17
@@ -148,9 +150,9 @@ class WalkerRandParams(_RandParams):
 
 @final
 class RandParamsTask(SimulatedTask):
-    """A robot with one body: reward v + 1 - 0.001 |a|^2, v the torso's forward velocity over the step.
+    """One task: the reward is v + 1 - 0.001 |a|^2, where v is the torso's forward velocity over the step.
 
-    The bonus is paid at the falling step too, as in the published code; Gymnasium's v5 withholds it.
+    The terminating step receives the bonus of 1 too, as in the published code; Gymnasium's v5 omits it.
     """
 
     def reward(self, action: FloatArray, simulator_reward: float, info: dict[str, Any]) -> float:

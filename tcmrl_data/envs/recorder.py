@@ -1,4 +1,4 @@
-"""Steps of lanes as trajectories: what rollouts store, and what a controller can read within an episode."""
+"""Recording of transitions as trajectories, for rollouts and for controllers."""
 
 from collections.abc import Mapping
 from typing import Any, final
@@ -16,7 +16,7 @@ KINDS: Mapping[str, type[np.generic]] = {
     "truncated": np.bool_,
     "active": np.bool_,
 }
-"""Recorded arrays of a transition, and their kinds of number."""
+"""Recorded arrays of a transition and their dtypes."""
 
 
 @final
@@ -41,11 +41,11 @@ class Recorder:
     def record(
         self, transition: Transition, extras: Mapping[str, npt.NDArray[np.generic]] | None = None
     ) -> None:
-        """Adds one step of all lanes; copies what it is given.
+        """Adds a copy of one step of all lanes.
 
         Args:
             transition: the step.
-            extras: further arrays (lanes,) of this step, the same names in every step.
+            extras: further arrays of shape (lanes,), with the same names in every step.
         """
         if not self._observations:
             self._observations.append(transition.observations.astype(np.float32))
@@ -56,9 +56,9 @@ class Recorder:
             self._extras.setdefault(name, []).append(array.copy())
 
     def trajectories(self) -> list[Trajectory]:
-        """What was recorded so far, one trajectory per lane, in float32; empty before the first step.
+        """The steps recorded so far, one float32 trajectory per lane; empty before the first step.
 
-        A lane's trajectory ends where its episode did.
+        A lane's trajectory ends with its episode.
         """
         if not self._observations:
             return []

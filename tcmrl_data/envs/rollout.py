@@ -1,4 +1,4 @@
-"""The only environment loop: builds roll out behavior policies with it, evaluation rolls out learned ones."""
+"""The environment loop of all rollouts, of behavior policies in builds and learned policies in evaluation."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -19,18 +19,18 @@ def roll_out(
     reset_seeds: Sequence[int],
     noise: Sequence[np.random.Generator],
 ) -> list[Trajectory]:
-    """One episode per lane, with one batched call of the controller per step.
+    """Rolls out one episode per lane, with one batched call of the controller per step.
 
-    The controller sees every lane at every step, finished lanes included, because rows of a batched
-    network call differ in the last bit with the batch's size. Actions are clipped to [-1, 1] before
-    they are executed and stored. Stored observations are the environment's stored view.
+    The controller receives all lanes at every step, including finished ones, because the results of a
+    batched network call depend on the batch size in their last bits. Actions are clipped to [-1, 1] before
+    they are executed and stored. The returned observations are the environment's stored view.
 
     Args:
-        environment: names the horizon, the action size and what is hidden from storage.
-        lanes: L episodes; may be reused from batch to batch.
-        controller: acts for all L lanes, and observes every step.
+        environment: defines the horizon, the action size and the stored view.
+        lanes: L lanes; may be used for several rollouts.
+        controller: acts for all L lanes and observes every step.
         reset_seeds: L seeds, one per episode.
-        noise: L generators, one per episode; each yields its episode's noise at once.
+        noise: L generators, one per episode; the noise of an episode is drawn at once.
 
     Returns:
         L trajectories in lane order; float32 observations, actions and rewards.

@@ -1,4 +1,4 @@
-"""Tasks of an environment: indices, parameters, and the split that never moves."""
+"""Tasks of an environment: indices, parameters and the fixed split."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,12 +12,12 @@ Split = Literal["train", "test"]
 
 @dataclass(frozen=True)
 class Task:
-    """One member of an environment.
+    """One task of an environment.
 
     Attributes:
-        index: position in the full task set; means the same task in every profile and selection.
+        index: position in the full task set; the same in every profile and selection.
         split: `train` or `test`.
-        parameters: JSON values that rebuild the task without drawing anything again.
+        parameters: JSON values that define the task.
     """
 
     index: int
@@ -26,7 +26,7 @@ class Task:
 
 
 def draw_tasks(environment: Environment) -> tuple[Task, ...]:
-    """All tasks of an environment, a function of its settings alone (its `task_seed`, never `--seed`)."""
+    """Draws all tasks of an environment; depends on its settings only (`task_seed`, not `--seed`)."""
     settings = environment.settings
     parameters = environment.draw_parameters(settings.tasks, settings.task_seed)
     permutation = keyed_generator(settings.task_seed, environment.name, NO_TASK, Purpose.SPLIT).permutation(

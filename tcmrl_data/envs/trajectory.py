@@ -1,4 +1,4 @@
-"""One episode, as stored and as served."""
+"""One episode as arrays."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,15 +18,15 @@ class Trajectory:
     """T steps of one episode with T + 1 observations.
 
     Attributes:
-        observations: (T + 1, observation_dim), the last one after the last action.
+        observations: (T + 1, observation_dim); the last one follows the last action.
         actions: (T, action_dim) in [-1, 1], as executed.
-        rewards: (T,), of the state after the move.
-        terminated: (T,) bool; True only where the task itself ended the episode.
-        truncated: (T,) bool; True where a time limit ended it.
+        rewards: (T,), for the state after the step.
+        terminated: (T,) bool; True if the task ended the episode at this step.
+        truncated: (T,) bool; True if a time limit ended the episode at this step.
         extras: further per-step arrays of shape (T,), such as `success`.
 
     Raises:
-        TrajectoryError: lengths or ranks disagree; the message prints both.
+        TrajectoryError: the lengths or ranks of the arrays do not match; the message states both.
 
     Example:
         >>> import numpy as np
@@ -66,5 +66,5 @@ class Trajectory:
 
     @property
     def undiscounted_return(self) -> float:
-        """Sum of the rewards, in double precision."""
+        """Sum of the rewards, computed in double precision."""
         return float(np.sum(self.rewards, dtype=np.float64))
