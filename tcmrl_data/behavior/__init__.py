@@ -1,1 +1,1 @@
-"""Behavior sources: what trains the policies that data come from."""
+"""Behavior sources, which train the policies that collect the data."""

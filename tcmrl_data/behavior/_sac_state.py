@@ -1,7 +1,7 @@
-"""Everything that a running Stable-Baselines3 SAC depends on, as arrays and JSON, and back.
+"""Capture and restore of the complete state of a Stable-Baselines3 SAC training.
 
-SB3's own save leaves out the replay buffer and every random generator, and its load seeds anew; with the
-state below, taken where an episode has just begun, a run continues bit for bit.
+SB3's `save` omits the replay buffer and the random generators, and its `load` seeds them again. With the
+state below, captured at the start of an episode, a training continues bit for bit.
 """
 
 import random
@@ -21,13 +21,13 @@ REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "don
 
 
 class EpisodeCounter(Protocol):
-    """Counts the training episodes; reset n has its own keyed seed."""
+    """An environment that counts its training episodes; reset n has its own keyed seed."""
 
     episode: int
 
 
 def capture(model: "SAC", episodes: EpisodeCounter) -> TrainingState:
-    """The state of a model whose running episode has no step yet."""
+    """Captures the state of a model whose current episode has no step yet."""
     import torch
 
     buffer = model.replay_buffer
@@ -54,7 +54,7 @@ def capture(model: "SAC", episodes: EpisodeCounter) -> TrainingState:
 
 
 def restore(model: "SAC", episodes: EpisodeCounter, checkpoint: TrainingState) -> int:
-    """Puts a freshly made model into the checkpoint's state; returns its environment steps."""
+    """Restores a checkpoint into a new model; returns the number of environment steps done."""
     import torch
 
     values, arrays = checkpoint.values, checkpoint.arrays
@@ -90,7 +90,7 @@ def _optimizers(model: "SAC") -> dict[str, "Optimizer"]:
 
 
 def _tensors(model: "SAC") -> Iterator[tuple[str, Any]]:
-    """All parameters and optimiser moments, by name."""
+    """Names and tensors of all parameters and optimizer moments."""
     yield from ((f"policy.{name}", tensor) for name, tensor in model.policy.state_dict().items())
     if model.log_ent_coef is not None:
         yield "log_entropy_coefficient", model.log_ent_coef
@@ -100,7 +100,7 @@ def _tensors(model: "SAC") -> Iterator[tuple[str, Any]]:
 
 
 def _prepare_optimizers(model: "SAC") -> None:
-    """Gives every optimiser its moment tensors, which Adam makes at its first step: one step of zeros."""
+    """Creates the optimizers' moment tensors by a step with zero gradients."""
     import torch
 
     for optimizer in _optimizers(model).values():
@@ -112,9 +112,9 @@ def _prepare_optimizers(model: "SAC") -> None:
 
 
 def _plain(value: Any) -> Any:
-    """A generator's state with arrays as `{"uint32": [...]}`."""
+    """A generator's state as JSON, with arrays as `{"uint32": [...]}`."""
     if isinstance(value, dict):
-        return {key: _plain(each) for key, each in value.items()}
+        return {key: _plain(member) for key, member in value.items()}
     if isinstance(value, np.ndarray):
         return {str(value.dtype): value.tolist()}
     return value
@@ -125,5 +125,5 @@ def _unplain(value: Any) -> Any:
         if set(value) == {"uint32"}:
             words: npt.NDArray[np.uint32] = np.array(value["uint32"], dtype=np.uint32)
             return words
-        return {key: _unplain(each) for key, each in value.items()}
+        return {key: _unplain(member) for key, member in value.items()}
     return value

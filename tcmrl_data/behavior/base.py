@@ -1,4 +1,4 @@
-"""Behavior sources make the policies of which a dataset holds rollouts."""
+"""Base class of behavior sources, which make the policies whose rollouts a dataset holds."""
 
 import abc
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,16 +17,16 @@ from tcmrl_data.foundation.plugins import Registry
 
 @dataclass(frozen=True)
 class BehaviorContext:
-    """What a source needs to make the behavior policies of a unit.
+    """The inputs of a source for the behavior policies of a unit.
 
     Attributes:
-        environment: the environment whose tasks are trained on.
+        environment: the environment of the tasks.
         tasks: the unit's tasks.
         seed: root seed of the build.
-        observation: view that the policies see.
-        reward: reward that the policies learn from.
-        report: called with the number of environment steps done since the last call.
-        checkpoints: where the training of given tasks keeps its state.
+        observation: the policies' view.
+        reward: the reward for training.
+        report: called with the number of environment steps since the last call.
+        checkpoints: returns the checkpoint folder for the training of the given tasks.
     """
 
     environment: Environment
@@ -47,9 +47,9 @@ class BehaviorSource(abc.ABC):
 
     name: ClassVar[str]
     Settings: ClassVar[type[BaseModel]]
-    """The recipe's `[behavior.<name>]` table."""
+    """Class of the recipe's `[behavior.<name>]` table."""
     extends: ClassVar[str | None] = None
-    """The source whose table holds the values that `[behavior.<name>]` leaves out."""
+    """Name of the source whose table gives the defaults of `[behavior.<name>]`."""
 
     def __init__(self, settings: BaseModel) -> None:
         self.settings = settings
@@ -57,7 +57,7 @@ class BehaviorSource(abc.ABC):
     @property
     @abc.abstractmethod
     def steps(self) -> tuple[int, ...]:
-        """The snapshot steps, ascending."""
+        """The snapshot steps, in ascending order."""
 
     @property
     @abc.abstractmethod
@@ -66,7 +66,7 @@ class BehaviorSource(abc.ABC):
 
     @property
     def group_size(self) -> int:
-        """Task indices per unit: tasks whose indices give the same quotient by it are trained together."""
+        """Number of task indices per unit: tasks with the same `index // group_size` are trained together."""
         return 1
 
     @property
@@ -75,20 +75,20 @@ class BehaviorSource(abc.ABC):
         return 0
 
     def with_warmup(self, steps: int) -> "BehaviorSource":
-        """This source with a warm-up of at most so many steps, so that a forecast soon sees updates."""
+        """This source with a warm-up of at most `steps` steps, for forecasts that measure updates."""
         return self
 
     @abc.abstractmethod
     def training_bytes(self, environment: Environment, num_tasks: int) -> int:
-        """Most memory that training `num_tasks` tasks takes, beside the process and the simulators."""
+        """Maximum memory in bytes for training `num_tasks` tasks, without the process and the simulators."""
 
     def provenance(self) -> Mapping[str, Any]:
-        """What is to be recorded with every part beside the settings; JSON."""
+        """Further JSON values to record in the provenance of every part."""
         return {}
 
     @abc.abstractmethod
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
-        """Yields every (task, snapshot) of the unit, each task's in ascending order of steps."""
+        """Yields (task, snapshot) for all snapshots of the unit, in ascending order of steps per task."""
 
 
 BEHAVIOR_SOURCES = Registry("tcmrl.behavior", "behavior source", BehaviorSource)

@@ -1,7 +1,8 @@
-"""Checkpoints of behavior training, in `.checkpoints/<unit>/` of a dataset until the unit's last part is out.
+"""Checkpoints of behavior training, in `.checkpoints/<unit>/` of a dataset until the unit is published.
 
-A checkpoint is one safetensors file whose name carries its sha256; counters and generator states stand as
-JSON in its header. Nothing is pickled; a damaged or foreign checkpoint is ignored, and training starts again.
+A checkpoint is one safetensors file named by its sha256; its header holds counters and generator states as
+JSON. Nothing is pickled. A checkpoint that is damaged or has another key is ignored, and training starts
+from the beginning.
 """
 
 import time
@@ -17,7 +18,7 @@ from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replac
 
 CHECKPOINT_SECONDS = 60.0
 CHECKPOINT_SHARE = 0.05
-"""Most of the time that may go into checkpoints."""
+"""Maximum share of the time for writing checkpoints."""
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,8 @@ class TrainingState:
     """State of a training.
 
     Attributes:
-        values: JSON; `steps` holds the environment steps done.
-        arrays: name to array.
+        values: JSON values; `steps` is the number of environment steps done.
+        arrays: arrays by name.
     """
 
     values: Mapping[str, Any]
@@ -34,14 +35,14 @@ class TrainingState:
 
 
 class CheckpointFolder:
-    """The latest checkpoint of one task's training.
+    """The latest checkpoint of a unit's training.
 
     Args:
         dataset: folder of the dataset.
-        unit: names the subfolder.
+        unit: name of the subfolder.
         key: digest of everything that the training depends on; a checkpoint with another key is ignored.
-        before: a checkpoint at or after this training step is of no use, since a snapshot is missing there.
-        seconds: time between two checkpoints, at least; 0 for one at every opportunity.
+        before: training step of the first missing snapshot; a checkpoint at this step or later is ignored.
+        seconds: minimum time between two checkpoints; 0 for one at every opportunity.
     """
 
     def __init__(
@@ -52,12 +53,12 @@ class CheckpointFolder:
         self._seconds, self._saved, self._cost = seconds, time.monotonic(), 0.0
 
     def is_due(self) -> bool:
-        """It is time for a checkpoint: large ones come more rarely, so that they cost little of the time."""
+        """Whether it is time for a checkpoint; slow checkpoints are written less often."""
         wait = max(self._seconds, self._cost / CHECKPOINT_SHARE) if self._seconds else 0.0
         return time.monotonic() - self._saved >= wait
 
     def save(self, checkpoint: TrainingState) -> None:
-        """Puts a checkpoint in the place of the last one."""
+        """Writes a checkpoint and removes the previous one."""
         from safetensors.numpy import save
 
         began = time.monotonic()
@@ -66,12 +67,12 @@ class CheckpointFolder:
         earlier = self._files()
         replace_file(self._folder / f"{sha256(data)}.safetensors", data, staging=self._dataset / STAGING)
         for file in earlier:
-            file.unlink(missing_ok=True)  # the same unit may run twice at once
+            file.unlink(missing_ok=True)  # the unit may run in two processes at the same time
         self._saved = time.monotonic()
         self._cost = self._saved - began
 
     def load(self) -> TrainingState | None:
-        """The last checkpoint, or None where there is none to trust."""
+        """The latest valid checkpoint, or None."""
         from safetensors import SafetensorError
         from safetensors.numpy import load
 

@@ -1,4 +1,4 @@
-"""One Stable-Baselines3 SAC per task: its own replay buffer, entropy coefficient and seed."""
+"""The source `sac`: one Stable-Baselines3 SAC per task."""
 
 from collections.abc import Iterator
 from itertools import pairwise
@@ -22,17 +22,17 @@ REPORT_EVERY = 100
 
 
 class SacSettings(BaseModel):
-    """The `[behavior.sac]` table; names as in Stable-Baselines3's SAC, defaults in the recipes.
+    """The `[behavior.sac]` table; names as in Stable-Baselines3's SAC, values in the recipes.
 
     Attributes:
         hidden: widths of the actor's and the critics' ReLU layers.
         steps: environment steps of training.
         warmup: uniform random steps before the first update.
-        snapshots: steps at which the policy is kept: 0 first, then none before the warm-up ends,
-            since they would all be the same untrained policy, and `steps` last.
+        snapshots: steps at which the policy is stored, from 0 to `steps`; all others lie after the warm-up,
+            during which the policy does not change.
         train_frequency: environment steps between updates.
         gradient_steps: gradient steps per update.
-        entropy: the entropy coefficient, above 0; `auto` learns it.
+        entropy: the entropy coefficient, above 0, or `auto` to learn it.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -94,10 +94,10 @@ class SacSource(BehaviorSource):
             yield from ((task, snapshot) for snapshot in self._train(context, task))
 
     def _train(self, context: BehaviorContext, task: Task) -> Iterator[Snapshot]:
-        """Trains in chunks; between two of them, at an episode's border, the state may be kept.
+        """Trains in chunks of steps and writes checkpoints between chunks, at the start of an episode.
 
-        SB3's `learn` called in chunks does what one call does, so neither chunks nor checkpoints change
-        a result.
+        Several calls of SB3's `learn` give the same result as one call, so chunks and checkpoints do not
+        change the result.
         """
         settings, checkpoints = self.settings, context.checkpoints([task])
         episodes = KeyedResets(context, task)
@@ -123,10 +123,10 @@ class SacSource(BehaviorSource):
 
 
 def training_bytes(settings: SacSettings, environment: Environment, *, num_agents: int) -> int:
-    """Most memory that training some agents at once takes.
+    """Maximum memory in bytes for training `num_agents` agents at the same time.
 
-    What a checkpoint keeps (replay buffers, weights and their moments) counts three times: the checkpoint
-    is a copy of it and the file another.
+    The content of a checkpoint (replay buffers, weights and moments) counts three times: as the training's
+    state, as the checkpoint and as the file's bytes.
     """
     observation_dim, action_dim = environment.observation_dim, environment.action_dim
     row = 2 * observation_dim + action_dim + 3
@@ -144,7 +144,7 @@ def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
 
 
 def make_model(settings: SacSettings, environment: gymnasium.Env[Any, Any], *, seed: int) -> "SAC":
-    """An untrained SAC; seeds the global generators of Python, NumPy and torch, as SB3 does."""
+    """Makes an untrained SAC; SB3 seeds the global generators of Python, NumPy and torch."""
     from stable_baselines3 import SAC
     from stable_baselines3.common.logger import Logger
 
@@ -170,11 +170,11 @@ def make_model(settings: SacSettings, environment: gymnasium.Env[Any, Any], *, s
 
 @final
 class KeyedResets(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Resets the n-th training episode with its own keyed seed, so that episodes never depend on history.
+    """Resets the n-th training episode with its own keyed seed, independent of earlier episodes.
 
     Attributes:
-        episode: number of the running episode; -1 before the first.
-        at_border: the running episode has no step yet.
+        episode: number of the current episode; -1 before the first.
+        at_border: True if the current episode has no step yet.
     """
 
     def __init__(self, context: BehaviorContext, task: Task) -> None:

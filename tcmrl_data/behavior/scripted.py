@@ -1,4 +1,4 @@
-"""The environment's own expert with Gaussian noise; several noise levels stand in for snapshots."""
+"""The source `scripted`: the environment's expert with Gaussian noise; a noise level is a snapshot."""
 
 from collections.abc import Iterator
 from typing import final
@@ -15,7 +15,7 @@ class ScriptedSettings(BaseModel):
     """The `[behavior.scripted]` table.
 
     Attributes:
-        noise: standard deviations, noisiest first; the n-th is snapshot step n.
+        noise: standard deviations in falling order; the n-th, counted from 0, is snapshot step n.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -31,7 +31,7 @@ class ScriptedSettings(BaseModel):
 
 @final
 class ScriptedSource(BehaviorSource):
-    """Experts need no training; they always see the full observation."""
+    """Experts with the full view; they need no training."""
 
     name = "scripted"
     Settings = ScriptedSettings

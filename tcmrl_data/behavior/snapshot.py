@@ -1,4 +1,4 @@
-"""Behavior policies as files: `policy.json` and, for networks, `policy.safetensors`; nothing is unpickled."""
+"""Behavior policies as files: `policy.json` and, for networks, `policy.safetensors`; no pickles."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,12 +23,13 @@ if TYPE_CHECKING:
     from stable_baselines3 import SAC
 
 LOG_STD_RANGE = (-20.0, 2.0)
-"""Clamp of the log standard deviation in Stable-Baselines3's SAC actor."""
-
+"""Limits of the log standard deviation in Stable-Baselines3's SAC actor."""
 
 DESCRIPTION_BYTES = 2**16
+"""Maximum size of `policy.json`."""
+
 HEADER_BYTES = 2**16
-"""Most that `policy.json`, and the header of `policy.safetensors`, may take."""
+"""Maximum size of the header of `policy.safetensors`."""
 
 
 class _Description(BaseModel):
@@ -46,7 +47,7 @@ class GaussianDescription(_Description):
     hidden: tuple[Annotated[int, Field(ge=1, le=2**16)], ...] = Field(max_length=16)
 
     def shapes(self) -> dict[str, tuple[int, ...]]:
-        """Name and shape of every tensor."""
+        """Shapes of all tensors, by name."""
         widths = (self.observation_dim, *self.hidden)
         layers = {f"hidden.{i}": (out, into) for i, (into, out) in enumerate(pairwise(widths))}
         layers |= dict.fromkeys(("mean", "log_std"), (self.action_dim, widths[-1]))
@@ -56,7 +57,7 @@ class GaussianDescription(_Description):
 
 
 class ScriptedDescription(_Description):
-    """The environment's own expert plus N(0, noise) on every action."""
+    """The environment's expert with N(0, noise) added to actions."""
 
     kind: Literal["scripted"] = "scripted"
     noise: float = Field(ge=0, le=10, allow_inf_nan=False)
@@ -71,9 +72,9 @@ class Snapshot:
     """A behavior policy of one task at one training step.
 
     Attributes:
-        step: environment steps trained, or for scripted policies the index from noisiest to cleanest.
-        description: what `policy.json` holds.
-        tensors: weights by name, float32; empty for scripted policies.
+        step: environment steps of training; for scripted policies the index of the noise level.
+        description: content of `policy.json`.
+        tensors: float32 weights by name; empty for scripted policies.
     """
 
     step: int
@@ -81,7 +82,7 @@ class Snapshot:
     tensors: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
 
     def digest(self) -> str:
-        """sha256 over the description and every tensor's dtype, shape and bytes."""
+        """The sha256 of the description and of every tensor's dtype, shape and bytes."""
         tensors = {
             name: [str(array.dtype), list(array.shape), sha256(np.ascontiguousarray(array).data)]
             for name, array in self.tensors.items()
@@ -89,10 +90,10 @@ class Snapshot:
         return digest({"policy": self.description.model_dump(mode="json"), "tensors": tensors})
 
     def controller(self, environment: Environment, parameters: Sequence[Parameters]) -> Controller:
-        """The policy acting in lanes of the given tasks.
+        """The policy as a controller for lanes with the given tasks.
 
         Raises:
-            SnapshotError: a scripted policy for an environment that has no expert.
+            SnapshotError: the policy is scripted, but the environment has no expert.
         """
         if isinstance(self.description, GaussianDescription):
             return GaussianController(self.description, self.tensors)
@@ -102,7 +103,7 @@ class Snapshot:
         return controller
 
     def files(self) -> dict[str, bytes]:
-        """File name to content."""
+        """The content of the policy's files, by name."""
         from safetensors.numpy import save
 
         files = {"policy.json": canonical_json(self.description.model_dump(mode="json"))}
@@ -112,11 +113,11 @@ class Snapshot:
 
 
 def read_snapshot(folder: Path, step: int) -> Snapshot:
-    """The snapshot in a part's folder.
+    """Reads the snapshot in a part's folder.
 
     Raises:
-        SnapshotError: a missing or malformed file, tensors of other names, shapes or dtypes than the
-            description asks for, or weights that are not finite.
+        SnapshotError: a file is missing or malformed, tensors do not have the names, shapes and dtypes of
+            the description, or weights are not finite.
     """
     try:
         values = parse_json(read_plain_file(folder / "policy.json", limit=DESCRIPTION_BYTES))
@@ -153,7 +154,7 @@ def _read_tensors(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str
 
 
 def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
-    """The actor of a Stable-Baselines3 SAC as a snapshot."""
+    """Makes a snapshot of a Stable-Baselines3 SAC's actor."""
     actor = model.policy.actor
     layers = [layer for layer in actor.latent_pi if hasattr(layer, "weight")]
     named = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {
@@ -175,19 +176,19 @@ def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
 
 
 def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
-    """Takes the actor out of a Stable-Baselines3 zip into a new folder, `policy.json` and its weights.
+    """Imports the actor of a Stable-Baselines3 zip file into a new folder with `policy.json` and its weights.
 
-    The zip holds pickles: reading it runs whatever code its author put there. Only an explicit command
-    calls this, never anything that opens a dataset.
+    The zip file holds pickles, and reading them can run code of the file's author. Only an explicit command
+    calls this function; opening a dataset never does.
 
     Args:
-        file: what `SAC.save` wrote.
-        out: folder to make.
+        file: a file written by `SAC.save`.
+        out: the new folder.
         observation: the view that the policy was trained with.
 
     Raises:
-        SnapshotError: no SAC with ReLU layers and actions in [-1, 1] in the file, or the folder exists.
-        StorageError: the disk refuses.
+        SnapshotError: the file holds no SAC with ReLU layers and actions in [-1, 1], or the folder exists.
+        StorageError: the operating system refuses to write a file.
     """
     import pickle
     import zipfile
@@ -232,7 +233,7 @@ def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
 
 @final
 class GaussianController(Controller):
-    """tanh(mean + std * noise), computed as Stable-Baselines3's SAC actor computes it."""
+    """Acts by tanh(mean + std * noise), computed like Stable-Baselines3's SAC actor."""
 
     def __init__(
         self, description: GaussianDescription, tensors: Mapping[str, npt.NDArray[np.float32]]
@@ -253,7 +254,7 @@ class GaussianController(Controller):
             mean = self._linear("mean", features)
             std = torch.clamp(self._linear("log_std", features), *LOG_STD_RANGE).exp()
             squashed = torch.tanh(mean + torch.from_numpy(noise) * std).numpy()
-        # Stable-Baselines3 scales actions to the box [-1, 1] even where that only rounds the last bit
+        # Stable-Baselines3 scales actions to [-1, 1]; here that can only change the last bit
         return -1.0 + 0.5 * (squashed + 1.0) * 2.0
 
     def _linear(self, name: str, features: "torch.Tensor") -> "torch.Tensor":

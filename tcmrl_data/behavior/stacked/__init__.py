@@ -1,1 +1,1 @@
-"""The source `stacked`: many agents of Stable-Baselines3's SAC as one stack of networks."""
+"""The source `stacked`: the SAC agents of several tasks, trained together as stacked networks."""

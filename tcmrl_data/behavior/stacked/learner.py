@@ -1,8 +1,8 @@
-"""One update of N independent SAC agents at once, each as Stable-Baselines3's SAC makes it.
+"""Joint updates of N independent SAC agents, equal to updates by Stable-Baselines3's SAC.
 
-SAC: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018. The losses are sums over the
-tasks of each task's mean over its batch, so an agent's gradient holds nothing of another agent. Gradients
-are written out (see `_stacked_networks`); tests hold them against autograd, and a lone agent against SB3.
+SAC: Haarnoja et al., "Soft Actor-Critic Algorithms and Applications", 2018. A loss is the sum over tasks of
+the mean over a task's batch, so an agent's gradient does not depend on other agents. Gradients are
+implemented by hand (see `networks.py`); tests compare them with autograd, and a single agent with SB3.
 """
 
 import math
@@ -18,17 +18,17 @@ from tcmrl_data.behavior.snapshot import LOG_STD_RANGE
 from tcmrl_data.behavior.stacked.networks import StackedNetwork, padded_zeros
 
 SQUASH_EPSILON = 1e-6
-"""Keeps the logarithm of 1 - tanh(u)^2 finite; Stable-Baselines3's value."""
+"""Keeps the logarithm of 1 - tanh(u)^2 finite; the value of Stable-Baselines3."""
 
 CRITICS = 2
 
 
 @dataclass(frozen=True)
 class Hyperparameters:
-    """What an update depends on; names as in the recipe.
+    """Hyperparameters of an update; names as in the recipe.
 
     Attributes:
-        entropy: the fixed coefficient, or None for a learned one whose target is -action_dim.
+        entropy: the fixed entropy coefficient; None for a learned one with target -action_dim.
     """
 
     hidden: tuple[int, ...]
@@ -41,14 +41,14 @@ class Hyperparameters:
 
 @dataclass(frozen=True)
 class ReplayBatch:
-    """A batch per task.
+    """One batch of B transitions per task.
 
     Attributes:
         observations: (N, B, observation_dim).
         actions: (N, B, action_dim).
         next_observations: (N, B, observation_dim).
         rewards: (N, B).
-        terminated: (N, B), 1 where the episode ended for good; a time limit is 0.
+        terminated: (N, B), 1 if the task ended the episode, else 0; a time limit is 0.
     """
 
     observations: Tensor
@@ -64,9 +64,9 @@ class PolicySample:
 
     Attributes:
         actions: (..., action_dim).
-        log_probs: (...,), log density of the actions.
-        scaled_noise: (..., action_dim), du / d log_std; 0 where log_std is clamped.
-        unclamped: (..., action_dim), 1 where log_std lies within its range, else 0.
+        log_probs: (...), log density of the actions.
+        scaled_noise: (..., action_dim), du / d log_std; 0 if log_std is clamped.
+        unclamped: (..., action_dim), 1 if log_std lies within its range, else 0.
     """
 
     actions: Tensor
@@ -76,12 +76,12 @@ class PolicySample:
 
 
 def sample_policy(head: Tensor, noise: Tensor) -> PolicySample:
-    """Samples from the actor's outputs.
+    """Samples actions, given the actor's outputs.
 
     log pi(a) = sum_i [-noise_i^2 / 2 - log std_i - log(2 pi) / 2 - log(1 - a_i^2 + epsilon)]
 
     Args:
-        head: (..., 2 * action_dim), means and log standard deviations.
+        head: (..., 2 * action_dim), means, then log standard deviations.
         noise: (..., action_dim), standard normal.
     """
     mean, raw = head.chunk(2, dim=-1)
@@ -101,8 +101,8 @@ def head_gradient(sample: PolicySample, entropy: Tensor, action_gradient: Tensor
     dL/d log_std = dL/du * std * noise - entropy (over B).
 
     Args:
-        sample: of (N, B) actions.
-        entropy: coefficients (N, 1, 1).
+        sample: (N, B) actions.
+        entropy: entropy coefficients, (N, 1, 1).
         action_gradient: dQ/da, (N, B, action_dim).
     """
     batch_size = sample.actions.shape[1]
@@ -114,7 +114,7 @@ def head_gradient(sample: PolicySample, entropy: Tensor, action_gradient: Tensor
 
 @final
 class StackedSac:
-    """N agents: actors, two critics each with targets, entropy coefficients, and their Adam moments.
+    """N agents; an agent has an actor, two critics with targets, an entropy coefficient and Adam moments.
 
     Critic k of agent n is network k * N + n of `critics`.
     """
@@ -144,11 +144,11 @@ class StackedSac:
         self._make_buffers(settings.batch_size)
 
     def _adam(self, vectors: Sequence[tuple[Tensor, Tensor]]) -> Adam:
-        """Adam over vectors whose gradients lie in given places, its moments already there."""
+        """Adam for (vector, gradient) pairs, with its moments already created."""
         for vector, gradient in vectors:
             vector.grad = gradient
         optimizer = Adam([vector for vector, _ in vectors], lr=self.settings.learning_rate, fused=True)
-        optimizer.step()  # gradients are zero: this makes the moments and changes nothing else
+        optimizer.step()  # creates the moments; changes nothing else, since gradients are zero
         for state in optimizer.state.values():
             state["step"].zero_()
         return optimizer
@@ -173,11 +173,11 @@ class StackedSac:
         return self._log_entropy[: self.num_agents]
 
     def initialize(self, agent: int, uniform: Callable[[tuple[int, ...]], Tensor]) -> None:
-        """Draws one agent's networks as torch's Linear does: uniform within 1 / sqrt(inputs).
+        """Initializes one agent's networks like torch's Linear, uniform within +-1 / sqrt(inputs).
 
         Args:
-            agent: which one.
-            uniform: draws from [-1, 1) in a given shape.
+            agent: the agent's index.
+            uniform: draws uniform numbers from [-1, 1) in a given shape.
         """
         for network, stack in ((agent, self.actors), *self._critics_of(agent)):
             for layer in stack.layers:
@@ -190,7 +190,7 @@ class StackedSac:
         return [(critic * self.num_agents + agent, self.critics) for critic in range(CRITICS)]
 
     def act(self, observations: Tensor, noise: Tensor) -> Tensor:
-        """Exploring actions (N, action_dim) for observations (N, observation_dim)."""
+        """Sampled actions (N, action_dim) for observations (N, observation_dim)."""
         head = self.actors.forward(observations[:, None], self._acting)[:, 0]
         return sample_policy(head, noise).actions
 
@@ -199,15 +199,17 @@ class StackedSac:
 
         Args:
             batch: B transitions per agent.
-            noise: (N, 2B, action_dim) standard normal, for the observations, then the next ones.
+            noise: (N, 2B, action_dim) standard normal; B for observations, then B for next observations.
         """
         batch_size = self.settings.batch_size
         entropy = self.log_entropy.exp()[:, None]
         torch.cat([batch.observations, batch.next_observations], dim=1, out=self._actor_inputs)
         both = sample_policy(self.actors.forward(self._actor_inputs, self._actor_outputs), noise)
         now = PolicySample(
-            *(each[:, :batch_size] for each in (both.actions, both.log_probs)),
-            *(each[:, :batch_size] for each in (both.scaled_noise, both.unclamped)),
+            both.actions[:, :batch_size],
+            both.log_probs[:, :batch_size],
+            both.scaled_noise[:, :batch_size],
+            both.unclamped[:, :batch_size],
         )
         next_values = self._values(self.targets, batch.next_observations, both.actions[:, batch_size:])
         soft_values = next_values.amin(dim=0) - entropy * both.log_probs[:, batch_size:]
@@ -217,7 +219,7 @@ class StackedSac:
         self.targets.parameters.lerp_(self.critics.parameters, self.settings.tau)
 
     def _values(self, critics: StackedNetwork, observations: Tensor, actions: Tensor) -> Tensor:
-        """Q of both critics, (2, N, B); inputs and layer outputs stay in the buffers."""
+        """Q values of both critics, (2, N, B); leaves inputs and layer outputs in the buffers."""
         halves = self._critic_inputs.view(CRITICS, self.num_agents, *self._critic_inputs.shape[1:])
         halves[..., : self._observation_dim] = observations
         halves[..., self._observation_dim :] = actions
@@ -225,7 +227,7 @@ class StackedSac:
         return values.view(CRITICS, self.num_agents, -1)
 
     def _step_critics(self, batch: ReplayBatch, goal: Tensor, log_probs: Tensor) -> None:
-        """Critic loss sum_k mean_B((Q_k - goal)^2) / 2, entropy loss -log_entropy mean_B(log pi + target)."""
+        """Minimizes sum_k mean_B((Q_k - goal)^2) / 2 and -log_entropy mean_B(log pi + target) by one step."""
         values = self._values(self.critics, batch.observations, batch.actions)
         self._critic_deltas[-1].view_as(values).copy_((values - goal) / goal.shape[1])
         self.critics.propagate(self._critic_outputs, self._critic_deltas)
@@ -234,7 +236,7 @@ class StackedSac:
         self._critic_optimizer.step()
 
     def _step_actors(self, observations: Tensor, sample: PolicySample, entropy: Tensor) -> None:
-        """Actor loss mean_B(entropy * log pi - min_k Q_k), with the critics as they are after their step."""
+        """Minimizes mean_B(entropy * log pi - min_k Q_k) by one step, with the critics after their step."""
         batch_size = self.settings.batch_size
         values = self._values(self.critics, observations, sample.actions)
         smaller = self._critic_deltas[-1].view_as(values)
@@ -244,13 +246,13 @@ class StackedSac:
         gradient = self.critics.input_gradient(self._critic_deltas, self._observation_dim)
         action_gradient = gradient.view(CRITICS, *sample.actions.shape).sum(dim=0)
         self._actor_deltas[-1].copy_(head_gradient(sample, entropy, action_gradient))
-        outputs = [each[:, :batch_size] for each in self._actor_outputs]
+        outputs = [output[:, :batch_size] for output in self._actor_outputs]
         self.actors.propagate(outputs, self._actor_deltas)
         self.actors.fill_gradient(self._actor_inputs[:, :batch_size], outputs, self._actor_deltas)
         self._actor_optimizer.step()
 
     def state(self) -> dict[str, Tensor]:
-        """Everything that changes, by name; the tensors themselves, so that writing to them restores it."""
+        """All tensors that updates change, by name; writing to them restores a state."""
         tensors = {
             "actors": self.actors.parameters,
             "critics": self.critics.parameters,

@@ -1,4 +1,4 @@
-"""Networks of equal shape, one per task, evaluated and differentiated together as batched matrix products."""
+"""Networks of equal shape, evaluated and differentiated together by batched matrix products."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 PADDING = 64
-"""Vectors are lengthened to a multiple of this, so that no element falls into the rest of a vector loop,
-where arithmetic may round differently: an agent then does not depend on its place in the group."""
+"""Vectors are padded to a multiple of this. The remainder of a vectorized loop may round differently, so
+without padding an agent's results would depend on its position in the group."""
 
 
 @dataclass(frozen=True)
@@ -34,13 +34,14 @@ class StackedLayer:
 class StackedNetwork:
     """S fully connected ReLU networks of equal shape.
 
-    All parameters lie in one flat vector and all gradients in another, so that one call steps them all. The
-    backward pass is written out; an update by autograd took 1.5 to 1.7 times as long (16 agents, 64 x 64).
+    All parameters are views into one flat vector and all gradients views into another, so that one optimizer
+    call updates them. The backward pass is implemented by hand; an update with autograd took 1.5 to 1.7 times
+    as long (16 agents, 64 x 64).
 
     Args:
         num_networks: S.
-        widths: inputs, hidden widths, outputs.
-        device: where everything lies.
+        widths: numbers of inputs, hidden units per layer, and outputs.
+        device: device of all tensors.
     """
 
     def __init__(self, num_networks: int, widths: Sequence[int], device: torch.device) -> None:
@@ -54,17 +55,17 @@ class StackedNetwork:
         self.gradient = torch.zeros_like(self.parameters)
         values, gradients = _views(self.parameters, shapes), _views(self.gradient, shapes)
         self.layers = [
-            StackedLayer(*each)
-            for each in zip(values[::2], values[1::2], gradients[::2], gradients[1::2], strict=True)
+            StackedLayer(*views)
+            for views in zip(values[::2], values[1::2], gradients[::2], gradients[1::2], strict=True)
         ]
 
     def buffers(self, num_rows: int) -> list[Tensor]:
-        """Room for every layer's outputs, or for gradients with respect to them: (S, rows, width) each."""
+        """Buffers for the layers' outputs or for their gradients, of shapes (S, num_rows, width)."""
         shapes = [(self.num_networks, num_rows, width) for width in self.widths[1:]]
         return [torch.zeros(shape, device=self.parameters.device) for shape in shapes]
 
     def forward(self, inputs: Tensor, outputs: Sequence[Tensor]) -> Tensor:
-        """Fills the layers' outputs for inputs (S, rows, widths[0]) and returns the last layer's."""
+        """Computes all layers' outputs for inputs (S, rows, widths[0]); returns the last layer's."""
         for layer, output in zip(self.layers, outputs, strict=True):
             torch.baddbmm(layer.bias, inputs, layer.weight.transpose(1, 2), out=output)
             if output is not outputs[-1]:
@@ -73,12 +74,12 @@ class StackedNetwork:
         return inputs
 
     def propagate(self, outputs: Sequence[Tensor], deltas: Sequence[Tensor]) -> None:
-        """Carries the loss's gradient from the last layer to the first.
+        """Propagates the loss's gradient from the last layer to the first.
 
         Args:
-            outputs: as filled by `forward`.
-            deltas: the last one holds dL / d outputs[-1]; filled for the others with the gradient before
-                the ReLU.
+            outputs: the outputs of `forward`.
+            deltas: the last one holds dL / d outputs[-1]; the others receive the gradients with respect to
+                the layers' outputs before the ReLU.
         """
         for index in range(len(self.layers) - 1, 0, -1):
             delta = deltas[index - 1]
@@ -86,7 +87,7 @@ class StackedNetwork:
             torch.ops.aten.threshold_backward.grad_input(delta, outputs[index - 1], 0, grad_input=delta)
 
     def fill_gradient(self, inputs: Tensor, outputs: Sequence[Tensor], deltas: Sequence[Tensor]) -> None:
-        """Writes the parameters' gradient, from what `forward` and `propagate` left."""
+        """Computes the parameters' gradient from the results of `forward` and `propagate`."""
         for layer, seen, delta in zip(self.layers, (inputs, *outputs), deltas, strict=False):
             torch.bmm(delta.transpose(1, 2), seen, out=layer.weight_gradient)
             torch.sum(delta, dim=1, keepdim=True, out=layer.bias_gradient)
@@ -102,7 +103,7 @@ def padded_zeros(size: int, device: torch.device) -> Tensor:
 
 
 def _views(flat: Tensor, shapes: Sequence[tuple[int, ...]]) -> list[Tensor]:
-    """Views of the given shapes, one after another, each starting at a multiple of PADDING."""
+    """Consecutive views with the given shapes; all start at multiples of PADDING."""
     starts = [0]
     for shape in shapes:
         starts.append(starts[-1] + _rounded_up(_size(shape)))

@@ -1,7 +1,7 @@
-"""The SAC agents of a group of tasks, trained in lockstep: the arithmetic of many small networks at once.
+"""The source `stacked`: trains the SAC agents of a group of tasks in lockstep.
 
-Each agent is an ordinary SAC of its own task, as the source `sac` trains it: same algorithm, same settings,
-its own replay buffer, entropy coefficient and random streams. Only rounding may depend on the group.
+Every agent has its own replay buffer, entropy coefficient and random streams, and the algorithm and settings
+of the source `sac`. Only rounding may depend on the group.
 """
 
 import contextlib
@@ -22,18 +22,18 @@ if TYPE_CHECKING:
     from tcmrl_data.behavior.stacked.training import GroupTraining
 
 REPORT_EVERY = 20
-"""Environment steps of the group between two reports of progress and looks at the clock."""
+"""Environment steps of the group between two reports of progress and checks for a due checkpoint."""
 
 
 class StackedSettings(SacSettings):
-    """The `[behavior.stacked]` table: that of `sac`, and how tasks are grouped.
+    """The `[behavior.stacked]` table: that of `sac`, and the grouping of tasks.
 
     Attributes:
         group: task indices per group; part of the data's identity, since it may change rounding.
-        device: where networks and replay buffers lie; another device rounds differently.
-        matmul_precision: torch's, of float32 matrix products: `medium` multiplies in bfloat16 where the
-            processor can, faster, with errors up to about 1e-2 of a product's standard deviation
-            (measured, and recorded with every part). Rollouts are always exact.
+        device: device of networks and replay buffers; another device rounds differently.
+        matmul_precision: torch's precision of float32 matrix products. `medium` multiplies in bfloat16 on
+            processors that support it, which is faster, with errors up to about 1e-2 of a product's standard
+            deviation (the error is measured and recorded with every part). It does not affect rollouts.
     """
 
     group: int = Field(ge=1)
@@ -82,11 +82,10 @@ class StackedSource(BehaviorSource):
         return {"matmul_precision": settings.matmul_precision, "matmul_error": error}
 
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
-        """As for every source; policies with weights that are not finite are left out and reported last.
+        """Yields every (task, snapshot) of the unit, except policies with weights that are not finite.
 
         Raises:
-            BuildError: after everything else, where the training of a task diverged, or there is no such
-                device.
+            BuildError: the device does not exist; or, after the last snapshot, a task's training diverged.
         """
         checkpoints = context.checkpoints(context.tasks)
         diverged: dict[int, int] = {}
@@ -119,7 +118,7 @@ class StackedSource(BehaviorSource):
 
 @contextlib.contextmanager
 def _matmul_precision(precision: str) -> Iterator[None]:
-    """Sets torch's precision of matrix products for a while: everything else in the process keeps its own."""
+    """Sets torch's precision of matrix products, and restores the previous one at the end."""
     import torch
 
     before = torch.get_float32_matmul_precision()
@@ -131,7 +130,7 @@ def _matmul_precision(precision: str) -> Iterator[None]:
 
 
 def _matmul_error(rows: int, width: int, device: str) -> float:
-    """Largest error of a layer's product of normal numbers, in the product's standard deviations."""
+    """Largest error of a matrix product of standard normal numbers, in the product's standard deviations."""
     import torch
 
     generator = torch.Generator().manual_seed(0)
@@ -143,7 +142,7 @@ def _matmul_error(rows: int, width: int, device: str) -> float:
 
 
 def _make_training(settings: StackedSettings, context: BehaviorContext) -> "GroupTraining":
-    """The untrained group."""
+    """Makes the untrained agents of a group."""
     import torch
 
     from tcmrl_data.behavior.stacked.learner import Hyperparameters

@@ -1,4 +1,4 @@
-"""The training of a group of tasks in lockstep: one environment step of every task, then one update of all.
+"""Training of a group of tasks in lockstep: one environment step of every task, then one joint update.
 
 Every random stream belongs to one task, so an agent draws the same numbers in any group.
 """
@@ -23,13 +23,13 @@ from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 
 @final
 class KeyedEpisodes:
-    """One running episode per task; the n-th training episode of a task has its own keyed seed.
+    """One current episode per task; the n-th training episode of a task has its own keyed seed.
 
     Attributes:
-        observations: what the policies see now, (N, observation_dim) float32.
-        numbers: numbers of the running episodes, (N,).
-        lengths: their steps so far, (N,).
-        actions: their actions so far, (N, horizon, action_dim) float32.
+        observations: the policies' current observations, (N, observation_dim) float32.
+        numbers: numbers of the current episodes, (N,).
+        lengths: steps of the current episodes so far, (N,).
+        actions: actions of the current episodes so far, (N, horizon, action_dim) float32.
     """
 
     def __init__(self, context: BehaviorContext) -> None:
@@ -41,7 +41,7 @@ class KeyedEpisodes:
         self.observations = self._see(self._lanes.reset([self._seed(lane) for lane in range(num_tasks)]))
 
     def step(self, actions: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Next observations, rewards and whether episodes ended for good; ended ones start anew."""
+        """Steps all tasks and restarts ended episodes; returns next observations, rewards and terminated."""
         everywhere = np.ones(len(self.numbers), dtype=bool)
         step = self._lanes.step(actions, everywhere)
         seen = self._see(step.observations)
@@ -55,7 +55,7 @@ class KeyedEpisodes:
         return seen, step.rewards, step.terminated
 
     def restore(self, numbers: Sequence[int], lengths: Sequence[int], actions: FloatArray) -> None:
-        """Goes back into episodes: an episode follows from its seed and its actions."""
+        """Restores the current episodes by repeating their actions from their seeds."""
         self.numbers[:], self.lengths[:], self.actions[:] = numbers, lengths, actions
         for lane in range(len(self.numbers)):
             self._restart(lane)
@@ -84,9 +84,9 @@ class KeyedEpisodes:
 
 @final
 class StackedReplay:
-    """The N replay buffers in one array; they fill in lockstep, the oldest rows are overwritten.
+    """N replay buffers in one array; they fill in lockstep, and new rows overwrite the oldest.
 
-    A row is (observation, action, next observation, reward, terminated), so that a batch is one gather.
+    A row is (observation, action, next observation, reward, terminated), so that one gather reads a batch.
     """
 
     def __init__(self, num_tasks: int, capacity: int, dims: tuple[int, int], device: torch.device) -> None:
@@ -97,14 +97,14 @@ class StackedReplay:
 
     @property
     def size(self) -> int:
-        """Transitions held per task."""
+        """Number of stored transitions per task."""
         return min(self.steps_added, self.rows.shape[1])
 
     def add(self, *columns: FloatArray | BoolArray) -> None:
         """Adds one transition per task, given as its five (N, …) columns."""
         num_tasks, capacity, _ = self.rows.shape
         row = np.concatenate(
-            [np.reshape(each, (num_tasks, -1)) for each in columns], axis=1, dtype=np.float32
+            [np.reshape(column, (num_tasks, -1)) for column in columns], axis=1, dtype=np.float32
         )
         self.rows[:, self.steps_added % capacity] = torch.from_numpy(row).to(self.rows.device)
         self.steps_added += 1
@@ -123,16 +123,16 @@ class StackedReplay:
 
 @final
 class GroupTraining:
-    """N agents in their environments.
+    """N agents and their environments.
 
     Args:
-        context: the tasks and where they run.
-        settings: of the update.
+        context: the tasks and their environment.
+        settings: hyperparameters of the update.
         warmup: uniform random steps before the first update.
         train_frequency: environment steps between updates.
         gradient_steps: gradient steps per update.
-        capacity: transitions that a replay buffer holds.
-        device: where networks and replay buffers lie.
+        capacity: capacity of a replay buffer in transitions.
+        device: device of networks and replay buffers.
     """
 
     def __init__(
@@ -169,7 +169,7 @@ class GroupTraining:
         self._episodes.close()
 
     def advance(self) -> None:
-        """One environment step of every task, and the updates that follow it."""
+        """Takes one environment step of every task, and the updates that are due after it."""
         observations = self._episodes.observations
         actions = self._act(observations)
         next_observations, rewards, terminated = self._episodes.step(actions)
@@ -182,13 +182,13 @@ class GroupTraining:
     def _act(self, observations: FloatArray) -> FloatArray:
         action_dim = self._dims[1]
         if self.steps < self._warmup:
-            draws = [each.uniform(-1.0, 1.0, action_dim) for each in self._acting]
-            return np.stack(draws).astype(np.float32)
-        noise = np.stack([each.standard_normal(action_dim, dtype=np.float32) for each in self._acting])
-        return self.learner.act(self._tensor(observations), self._tensor(noise)).cpu().numpy()
+            actions = [generator.uniform(-1.0, 1.0, action_dim) for generator in self._acting]
+            return np.stack(actions).astype(np.float32)
+        noise = [generator.standard_normal(action_dim, dtype=np.float32) for generator in self._acting]
+        return self.learner.act(self._tensor(observations), self._tensor(np.stack(noise))).cpu().numpy()
 
     def _draw(self) -> tuple[ReplayBatch, Tensor]:
-        """A batch drawn with replacement, and the noise of one update."""
+        """Draws a batch with replacement, and the noise of one update."""
         batch_size, action_dim = self._settings.batch_size, self._dims[1]
         positions = np.empty((len(self._updating), batch_size), dtype=np.int64)
         noise = np.empty((len(self._updating), 2 * batch_size, action_dim), dtype=np.float32)
@@ -201,11 +201,13 @@ class GroupTraining:
         return torch.from_numpy(array).to(self._device)
 
     def snapshot(self, agent: int) -> Snapshot:
-        """The policy of one agent, as it is now."""
+        """A snapshot of one agent's current policy."""
         layers = self.learner.actors.layers
         arrays = [(layer.weight[agent].cpu().numpy(), layer.bias[agent, 0].cpu().numpy()) for layer in layers]
-        named = {f"hidden.{index}": each for index, each in enumerate(arrays[:-1])}
-        (mean_weight, log_std_weight), (mean_bias, log_std_bias) = (np.split(each, 2) for each in arrays[-1])
+        named = {f"hidden.{index}": pair for index, pair in enumerate(arrays[:-1])}
+        (mean_weight, log_std_weight), (mean_bias, log_std_bias) = (
+            np.split(array, 2) for array in arrays[-1]
+        )
         named |= {"mean": (mean_weight, mean_bias), "log_std": (log_std_weight, log_std_bias)}
         description = GaussianDescription(
             observation=self._context.observation,
@@ -221,8 +223,8 @@ class GroupTraining:
         return Snapshot(self.steps, description, tensors)
 
     def capture(self) -> TrainingState:
-        """Everything that the training depends on, at any step."""
-        arrays = {f"learner.{name}": each.cpu().numpy() for name, each in self.learner.state().items()}
+        """Captures the complete state of the training, at any step."""
+        arrays = {f"learner.{name}": tensor.cpu().numpy() for name, tensor in self.learner.state().items()}
         arrays["replay"] = np.ascontiguousarray(self._replay.rows[:, : self._replay.size].cpu().numpy())
         arrays["episodes.actions"] = self._episodes.actions
         values = {
@@ -231,13 +233,13 @@ class GroupTraining:
                 "numbers": self._episodes.numbers.tolist(),
                 "lengths": self._episodes.lengths.tolist(),
             },
-            "acting": [copy.deepcopy(each.bit_generator.state) for each in self._acting],
-            "updating": [copy.deepcopy(each.bit_generator.state) for each in self._updating],
+            "acting": [copy.deepcopy(generator.bit_generator.state) for generator in self._acting],
+            "updating": [copy.deepcopy(generator.bit_generator.state) for generator in self._updating],
         }
         return TrainingState(values, arrays)
 
     def restore(self, checkpoint: TrainingState) -> None:
-        """Goes on where a checkpoint was taken, bit for bit."""
+        """Restores a checkpoint, so that training continues bit for bit."""
         values, arrays = checkpoint.values, checkpoint.arrays
         self.steps = self._replay.steps_added = values["steps"]
         for name, tensor in self.learner.state().items():
