@@ -1,1 +1,1 @@
-"""What `sampler.py` is made of: packed rows in memory or in the cache, draws, gathers, prefetching."""
+"""Sampling of meta-training batches: packed rows in memory or in the cache, draws, gathers, prefetching."""

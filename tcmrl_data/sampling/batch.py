@@ -1,4 +1,4 @@
-"""What meta-training is served: batches, and statistics of the data."""
+"""Meta-training batches, and statistics of the data."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,21 +12,21 @@ from tcmrl_data.foundation.errors import RequestError
 
 @dataclass(frozen=True)
 class Steps:
-    """Transitions with any leading shape; observations and next observations share their memory.
+    """Transitions with any leading shape; observations and next observations share memory.
 
-    What lies beyond an episode's end is zero, but for the last observation, which may stand there again.
+    Padding after the end of an episode is zero, except that it may repeat the last observation.
 
     Attributes:
         observations: (..., observation_dim).
         actions: (..., action_dim) in [-1, 1].
-        rewards: (...,).
+        rewards: (...).
         next_observations: (..., observation_dim).
-        terminated: (...,) float, 1 where the task ended the episode; a time limit is 0.
-        mask: (...,) bool, False on padding.
-        returns_to_go: (...,) sum over k of gamma^k r_{t+k} to the episode's end, whatever ended it.
-        discounts_to_end: (...,) gamma^(T - t), which weighs the value of the final observation.
-        final_observations: (..., observation_dim) s_T.
-        times: (...,) int64, t.
+        terminated: (...) float, 1 if the task ended the episode, else 0; a time limit is 0.
+        mask: (...) bool, False on padding.
+        returns_to_go: (...) sum over k of gamma^k r_{t+k} to the end of the episode, for any kind of end.
+        discounts_to_end: (...) gamma^(T - t), the weight of the final observation's value.
+        final_observations: (..., observation_dim), s_T.
+        times: (...) int64, t.
 
     The last four are None unless the kind was requested with `returns=True`.
     """
@@ -47,14 +47,14 @@ class Steps:
 class Batch:
     """The n-th batch of a stream, float32.
 
-    Its tensors are views into one buffer, to be read and not written. The buffer is used again once
-    nothing refers to any of them any more, never earlier: batches may be kept.
+    Its tensors are views into one buffer and must not be written to. The buffer is reused when no tensor
+    refers to it any more, so batches may be kept.
 
     Attributes:
         task_indices: (tasks,) int64, distinct.
-        steps: the requested kinds by name. Leading shapes are (tasks, number) of transitions, (tasks, number,
-            length) of windows, each inside one episode, and (tasks, number, longest episode) of
-            trajectories, padded at the end.
+        steps: the requested kinds by name. The leading shape of transitions is (tasks, number), of windows
+            (tasks, number, length), and of trajectories, padded at the end, (tasks, number, longest episode).
+            A window lies within one episode.
 
     Example:
         >>> batch = sampler.batch(0)  # doctest: +SKIP
@@ -69,7 +69,7 @@ class Batch:
         """The steps of one kind.
 
         Raises:
-            RequestError: the batch's request has no such kind, or a number of 0 for it.
+            RequestError: the batch's request has no such kind, or asks for 0 of it.
         """
         if name not in self.steps:
             raise RequestError(f"no kind {name!r} in this batch, which holds {self.names()}; request it")
@@ -79,7 +79,7 @@ class Batch:
         return name in self.steps
 
     def names(self) -> list[str]:
-        """The kinds in the order of the request."""
+        """The names of the kinds, in the order of the request."""
         return list(self.steps)
 
 
@@ -89,10 +89,10 @@ class Moments:
 
     Attributes:
         observation_mean, observation_std: (observation_dim,).
-        delta_mean, delta_std: (observation_dim,), of next observation minus observation.
+        delta_mean, delta_std: (observation_dim,), for next observation minus observation.
         action_mean, action_std: (action_dim,).
-        reward_mean, reward_std, reward_min, reward_max: per step.
-        longest_episode: steps.
+        reward_mean, reward_std, reward_min, reward_max: statistics of the reward per step.
+        longest_episode: length of the longest episode in steps.
     """
 
     observation_mean: npt.NDArray[np.float64]

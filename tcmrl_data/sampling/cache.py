@@ -1,7 +1,7 @@
-"""The cache of decoded steps: for selections that do not fit into memory, read through the page cache.
+"""The cache of decoded steps, for selections that do not fit into memory; read through the page cache.
 
-Entries lie in `<cache>/rows/<key>`; the key is made of the dataset's Merkle root and the selection. Together
-they stay under a cap; what was used longest ago goes first, what is in use stays.
+An entry is a folder `<cache>/rows/<key>`; its key is a digest of the dataset's Merkle root and the selection.
+If the entries exceed a limit, the least recently used entry that is not in use is evicted.
 """
 
 import contextlib
@@ -42,17 +42,21 @@ if TYPE_CHECKING:
     from tcmrl_data.dataset.selection import Selection
 
 CACHE_BYTES = 100 * 10**9
-"""What all entries may take, unless TCMRL_CACHE_LIMIT says otherwise (such as 20G)."""
+"""Default of TCMRL_CACHE_LIMIT, the maximum size of all entries."""
 
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """An entry of the cache, for people.
+    """An entry of the cache.
 
     Attributes:
-        bytes: on disk.
-        used: Unix time of its latest use.
-        in_use: a process reads it now.
+        key: name of its folder.
+        environment: name of the dataset's environment; empty if the entry is damaged.
+        root: Merkle root of the dataset; empty if the entry is damaged.
+        tasks: number of selected tasks.
+        bytes: size on disk.
+        used: Unix time of the last use.
+        in_use: True if a process reads the entry.
     """
 
     key: str
@@ -65,7 +69,7 @@ class CacheEntry:
 
 
 def cache_folder() -> Path:
-    """TCMRL_CACHE, or `tcmrl` in the user's cache folder (XDG_CACHE_HOME, or ~/.cache)."""
+    """TCMRL_CACHE, or `tcmrl` in the user's cache folder (XDG_CACHE_HOME or ~/.cache)."""
     own = os.environ.get("TCMRL_CACHE")
     return Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tcmrl"
 
@@ -76,16 +80,16 @@ def load_rows(
     memory_limit: int | None = None,
     say: Callable[[str], None] = lambda message: None,
 ) -> PackedRows:
-    """The rows of a selection: in memory where they fit, else from the cache.
+    """Loads the rows of a selection into memory, or from the cache if they do not fit.
 
     Args:
-        selection: what to read.
-        memory_limit: bytes that the rows may take in memory; half of what is available if left out.
-        say: told when the cache is used, and why.
+        selection: the selection.
+        memory_limit: maximum size of the rows in memory, in bytes; None for half of the available memory.
+        say: called with a message if the cache is used.
 
     Raises:
-        CacheError: they do not fit, and the cache cannot take them.
-        StoreError: arrays that do not decode or do not form episodes; names the part.
+        CacheError: the rows fit neither into memory nor into the cache.
+        StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
     """
     needed = _table_bytes(selection)
     limit = available_memory() // 2 if memory_limit is None else memory_limit
@@ -97,17 +101,17 @@ def load_rows(
 
 
 def cached_rows(selection: "Selection", *, say: Callable[[str], None] = lambda message: None) -> PackedRows:
-    """The rows of a selection from the cache, decoded into it first where they are not there.
+    """Opens the rows of a selection from the cache; decodes them into the cache if they are not there.
 
-    The entry stays locked against eviction as long as its table is in use.
+    The entry is locked against eviction while its table is in use.
 
     Args:
-        selection: what to read.
-        say: told of decoding before it starts.
+        selection: the selection.
+        say: called with a message before decoding starts.
 
     Raises:
-        CacheError: no room, or the folder cannot be written.
-        StoreError: arrays that do not decode or do not form episodes; names the part.
+        CacheError: the cache has no room, or its folder cannot be written.
+        StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
     """
     folder = cache_folder()
     root = selection.dataset.manifest.root
@@ -120,11 +124,11 @@ def cached_rows(selection: "Selection", *, say: Callable[[str], None] = lambda m
                 return rows
             say(f"decoding {selection.dataset.folder} into {entry}; this happens once")
             _remove_abandoned(folder)
-            _evict(folder, key)  # what lies there is torn
+            _evict(folder, key)  # an entry that cannot be opened is damaged
             make_folders(folder)
             _make_room(folder, _table_bytes(selection))
             write_entry(folder, entry, selection)
-    raise CacheError(f"{entry} vanishes as it is made; give TCMRL_CACHE_LIMIT more room")
+    raise CacheError(f"{entry} was evicted while it was written; raise TCMRL_CACHE_LIMIT")
 
 
 def list_cache() -> tuple[CacheEntry, ...]:
@@ -133,29 +137,27 @@ def list_cache() -> tuple[CacheEntry, ...]:
     for entry in _entries(cache_folder()):
         with contextlib.suppress(FileNotFoundError), (entry / RECORD).open("rb") as file:
             record = read_entry(file)
-            used, size = (
-                os.fstat(file.fileno()).st_mtime,
-                sum(each.stat().st_size for each in entry.iterdir()),
-            )
+            used = os.fstat(file.fileno()).st_mtime
+            num_bytes = sum(path.stat().st_size for path in entry.iterdir())
             in_use = not try_lock(file, fcntl.LOCK_EX)
             about = (record.environment, record.root, len(record.selection)) if record else ("", "", 0)
-            found.append(CacheEntry(entry.name, *about, size, used, in_use))
-    return tuple(sorted(found, key=lambda each: each.used))
+            found.append(CacheEntry(entry.name, *about, num_bytes, used, in_use))
+    return tuple(sorted(found, key=lambda entry: entry.used))
 
 
 def clear_cache() -> tuple[CacheEntry, ...]:
-    """Removes every entry that no process reads; returns those that were removed."""
+    """Removes every entry that no process reads; returns the removed entries."""
     folder = cache_folder()
-    removed = tuple(each for each in list_cache() if _evict(folder, each.key))
+    removed = tuple(entry for entry in list_cache() if _evict(folder, entry.key))
     _remove_abandoned(folder)
     return removed
 
 
 def cache_limit() -> int:
-    """What all entries may take: TCMRL_CACHE_LIMIT, or 100 GB.
+    """The maximum size of all entries in bytes: TCMRL_CACHE_LIMIT (such as `20G`), or 100 GB.
 
     Raises:
-        CacheError: the variable is no size.
+        CacheError: the variable is not a valid size.
     """
     text = os.environ.get("TCMRL_CACHE_LIMIT")
     return parse_bytes(text) if text else CACHE_BYTES
@@ -163,10 +165,10 @@ def cache_limit() -> int:
 
 @contextlib.contextmanager
 def _named_cache(folder: Path) -> Iterator[None]:
-    """Turns a refusal of the disk into an error that says where the cache may lie instead.
+    """Turns errors of file operations into an error that says how to move the cache.
 
     Raises:
-        CacheError: the disk refuses.
+        CacheError: the operating system refuses a file operation within the block.
     """
     try:
         yield
@@ -185,18 +187,18 @@ def _table_bytes(selection: "Selection") -> int:
 
 def _entries(folder: Path) -> list[Path]:
     rows = folder / "rows"
-    return sorted(each for each in rows.iterdir() if each.is_dir()) if rows.is_dir() else []
+    return sorted(path for path in rows.iterdir() if path.is_dir()) if rows.is_dir() else []
 
 
 def _make_room(folder: Path, needed: int) -> None:
-    """Evicts what was used longest ago until a new entry fits under the cap and on the disk.
+    """Evicts the least recently used entries until a new entry fits below the limit.
 
     Raises:
-        CacheError: it does not fit on the disk.
+        CacheError: the new entry does not fit on the disk.
     """
     entries = list(list_cache())
     limit = cache_limit()
-    while entries and sum(each.bytes for each in entries) + needed > limit:
+    while entries and sum(entry.bytes for entry in entries) + needed > limit:
         _evict(folder, entries.pop(0).key)
     free = shutil.disk_usage(folder).free
     if needed > free:
@@ -207,7 +209,7 @@ def _make_room(folder: Path, needed: int) -> None:
 
 
 def _evict(folder: Path, key: str) -> bool:
-    """Removes an entry unless a process reads it; renamed first, so that nobody opens half of it."""
+    """Removes an entry unless a process reads it; renames it first, so that no process opens a part of it."""
     entry = folder / "rows" / key
     if not entry.is_dir():
         return False
@@ -217,14 +219,14 @@ def _evict(folder: Path, key: str) -> bool:
             if not try_lock(file, fcntl.LOCK_EX) or not is_current(file, entry / RECORD):
                 return False
         make_folders(folder / STAGING)
-        gone = folder / STAGING / f"evicted.{uuid.uuid4().hex}"
-        os.replace(entry, gone)
-        remove_tree(gone)
+        evicted = folder / STAGING / f"evicted.{uuid.uuid4().hex}"
+        os.replace(entry, evicted)
+        remove_tree(evicted)
     return True
 
 
 def _remove_abandoned(folder: Path) -> None:
-    """Removes what killed processes left in the staging folder."""
+    """Removes files of killed processes from the staging folder."""
     if (folder / STAGING).is_dir():
         with contextlib.suppress(LockedError), lock_file(folder / LOCK, f"cache {folder}"):
             remove_abandoned(folder)

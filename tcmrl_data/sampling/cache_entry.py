@@ -1,8 +1,8 @@
 """One entry of the cache: packed rows as files that are mapped into memory.
 
-`rows.f32` is the table, `episodes.i64` holds starts, lengths and task ranges, `record.json` the digest of
-its own text in front of it. An entry is published by one rename after everything in it is forced to disk,
-and never changes. Whoever reads it holds a shared lock on its record.
+`rows.f32` is the table. `episodes.i64` holds starts, lengths and task ranges. `record.json` holds the digest
+of the record in its first line, then the record. An entry is forced to disk, published by one rename, and
+never changes. A reader holds a shared lock on its record.
 """
 
 import contextlib
@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from tcmrl_data.dataset.selection import Selection
 
 FORMAT = 1
-"""Raised when the layout of an entry changes; entries of another format are never opened."""
+"""Increased when the layout of an entry changes; entries of another format are not opened."""
 
 RECORD = "record.json"
 ROWS = "rows.f32"
@@ -53,16 +53,16 @@ EPISODES = "episodes.i64"
 
 
 class EntryRecord(BaseModel):
-    """What an entry holds.
+    """Description of an entry.
 
     Attributes:
-        format: FORMAT of the version that wrote it.
-        environment: the dataset's environment.
+        format: FORMAT of the version that wrote the entry.
+        environment: name of the dataset's environment.
         root: Merkle root of the dataset.
-        selection: per task, its index and its snapshot steps.
-        shape: rows and floats per row.
-        episodes: episodes with a step.
-        episodes_sha256: of the file of episodes.
+        selection: (index, snapshot steps) per task.
+        shape: (rows, floats per row) of the table.
+        episodes: number of episodes with at least one step.
+        episodes_sha256: digest of the file of episodes.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -82,14 +82,14 @@ class EntryRecord(BaseModel):
 
 
 def open_entry(entry: Path, selection: "Selection") -> PackedRows | None:
-    """The rows of an entry, locked as long as its table lives; None where there is no whole entry."""
+    """Opens the rows of an entry and locks it while its table is in use; None if it is missing or damaged."""
     try:
         file = (entry / RECORD).open("rb")
     except FileNotFoundError:
         return None
     with contextlib.ExitStack() as stack:
         stack.enter_context(file)
-        fcntl.flock(file, fcntl.LOCK_SH)  # an eviction holds it for a moment only
+        fcntl.flock(file, fcntl.LOCK_SH)  # an eviction or a listing holds the exclusive lock only briefly
         record = read_entry(file)
         if not is_current(file, entry / RECORD) or record is None:
             return None
@@ -97,7 +97,7 @@ def open_entry(entry: Path, selection: "Selection") -> PackedRows | None:
         if episodes is None or not _has_size(entry / ROWS, record.row_bytes):
             return None
         os.utime(entry / RECORD)
-        # copy on write: torch wants memory that could be written, and the file must never be
+        # copy on write, because torch requires writable memory and the file must not change
         table: Table = np.memmap(entry / ROWS, dtype=np.float32, mode="c", shape=record.shape)
         weakref.finalize(table, stack.pop_all().close)
         return selection_rows(selection, table, episodes)
@@ -108,19 +108,19 @@ def _has_size(path: Path, size: int) -> bool:
 
 
 def is_current(file: IO[bytes], path: Path) -> bool:
-    """Whether the open file is still the one at the path."""
+    """Whether the path still refers to the open file."""
     return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())
 
 
 def selected(selection: "Selection") -> tuple[tuple[int, tuple[int, ...]], ...]:
-    """A selection in plain terms: per task, its index and its snapshot steps."""
+    """A selection as (task index, snapshot steps) per task."""
     return tuple((task.index, selection.steps[task.index]) for task in selection.tasks)
 
 
 def read_entry(file: IO[bytes]) -> EntryRecord | None:
-    """The record, if it is whole and of this format."""
-    sealed, _, data = file.read().partition(b"\n")
-    if sha256(data).encode() != sealed:
+    """Reads a record; None if it is damaged or has another format."""
+    recorded, _, data = file.read().partition(b"\n")
+    if sha256(data).encode() != recorded:
         return None
     try:
         record = EntryRecord.model_validate_json(data)
@@ -140,16 +140,16 @@ def _read_episodes(file: Path, record: EntryRecord, num_tasks: int) -> Episodes 
 
 
 def write_entry(folder: Path, entry: Path, selection: "Selection") -> None:
-    """Decodes a selection part by part into a new entry; loses quietly against another process.
+    """Decodes a selection part by part into a new entry; does nothing if the entry exists at the end.
 
     Args:
         folder: the cache.
-        entry: where the entry is to be.
-        selection: what to decode.
+        entry: folder of the entry.
+        selection: the selection.
 
     Raises:
-        StorageError: the disk refused; nothing is published.
-        StoreError: arrays that do not decode or do not form episodes; names the part.
+        StorageError: the operating system refuses a file operation; nothing is published.
+        StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
     """
     plan = plan_rows(selection)
     shape = table_shape(selection, plan)
@@ -163,7 +163,7 @@ def write_entry(folder: Path, entry: Path, selection: "Selection") -> None:
                 lengths = _write_rows(staged / ROWS, plan, shape)
             episodes = Episodes.of(lengths, [part.task for part in plan])
             tables = (episodes.starts, episodes.lengths, episodes.task_ranges)
-            data = b"".join(each.astype(np.int64).tobytes() for each in tables)
+            data = b"".join(table.astype(np.int64).tobytes() for table in tables)
             record = EntryRecord(
                 format=FORMAT,
                 environment=selection.dataset.name,
@@ -185,17 +185,17 @@ def write_entry(folder: Path, entry: Path, selection: "Selection") -> None:
 
 
 def _write_rows(file: Path, plan: Sequence[PartRows], shape: tuple[int, int]) -> list[Indices]:
-    """Writes the table with ordinary writes, so that only the parts at work are in memory."""
+    """Writes the table part by part, so that only the parts being read are in memory."""
     with file.open("xb", buffering=0) as out:
         out.truncate(4 * shape[0] * shape[1])
 
         def write(part: PartRows) -> Indices:
             rows: Table = np.zeros((part.last - part.first, shape[1]), dtype=np.float32)
             lengths = read_part(part, rows)
-            left, at = memoryview(rows.data).cast("B"), 4 * shape[1] * part.first
-            while left:
-                written = os.pwrite(out.fileno(), left, at)
-                left, at = left[written:], at + written
+            remaining, offset = memoryview(rows.data).cast("B"), 4 * shape[1] * part.first
+            while remaining:
+                written = os.pwrite(out.fileno(), remaining, offset)
+                remaining, offset = remaining[written:], offset + written
             return lengths
 
         lengths = list(each_part(plan, write))

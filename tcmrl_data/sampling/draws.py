@@ -1,4 +1,4 @@
-"""Which rows make batch n: index arithmetic alone, for several batches at a time."""
+"""Draws the row indices of batches; does not read the rows."""
 
 import hashlib
 from dataclasses import dataclass
@@ -14,15 +14,16 @@ from tcmrl_data.sampling.rows import Episodes, Indices
 Key = npt.NDArray[np.unsignedinteger[Any]]
 
 BLOCK = 16
-"""Batches whose indices are computed together; they come from one run of the counter."""
+"""Number of batches whose indices are drawn together, from one value of the generators' counter."""
 
 
 class Draw(NamedTuple):
-    """The rows of one batch.
+    """The indices of one batch.
 
     Attributes:
         tasks: (tasks,) positions of the tasks.
-        picks: (tasks, number) by kind: rows of transitions, first rows of windows, episodes.
+        picks: (tasks, number) indices by name of the kind: rows of transitions, first rows of windows, or
+            episodes of trajectories.
     """
 
     tasks: Indices
@@ -31,13 +32,13 @@ class Draw(NamedTuple):
 
 @dataclass(frozen=True)
 class Starts:
-    """The rows from which K steps stay inside an episode, numbered from 0 in their order.
+    """The rows at which a window of K steps within an episode can start, numbered from 0 in ascending order.
 
     Attributes:
-        before: (episodes,) how many of them lie in earlier episodes.
-        first_rows: (episodes,) first row of each episode.
-        task_ranges: (tasks, 2) first and last + 1 of each task's numbers.
-        per_episode: how many each episode has, where all have equally many; 0 elsewhere.
+        before: (episodes,) number of starts in earlier episodes.
+        first_rows: (episodes,) first row of every episode.
+        task_ranges: (tasks, 2) first number and last number + 1 of every task's starts.
+        per_episode: number of starts per episode, if all episodes have equally many; else 0.
     """
 
     before: Indices
@@ -47,21 +48,21 @@ class Starts:
 
     @classmethod
     def of(cls, episodes: Episodes, steps: int) -> "Starts":
-        """Those for windows of `steps` steps; 1 for transitions."""
+        """The starts of windows of `steps` steps; `steps` is 1 for transitions."""
         counts = np.maximum(episodes.lengths - steps + 1, 0)
         ends = np.concatenate([[0], np.cumsum(counts)])
         same = int(counts[0]) if len(counts) and (counts == counts[0]).all() else 0
         return cls(ends[:-1], episodes.starts, ends[episodes.task_ranges], same)
 
     def draw(self, tasks: Indices, uniform: Uniform) -> Indices:
-        """Rows uniform over each task's, one per number in [0, 1), (..., tasks, count).
+        """Draws rows (..., tasks, count), uniform over the starts of the row's task.
 
         Args:
-            tasks: (..., tasks) positions.
-            uniform: the numbers.
+            tasks: (..., tasks) positions of tasks.
+            uniform: (..., tasks, count) uniform random numbers in [0, 1).
         """
         first, last = self.task_ranges[tasks][..., None, 0], self.task_ranges[tasks][..., None, 1]
-        if self.per_episode:  # an episode, and of what is left of the number a place in it
+        if self.per_episode:  # the integer part selects an episode, the fraction a start within it
             places = uniform * ((last - first) / self.per_episode)
             drawn = places.astype(np.int64)
             places -= drawn
@@ -77,15 +78,15 @@ class Starts:
 
 
 class Draws:
-    """Draws batches from the episodes of the tasks; batch n is a pure function of (sequence, n).
+    """Draws batches from the tasks' episodes; batch n is a pure function of (sequence, n).
 
-    Tasks and every kind draw from counter-based generators of their own (Philox; Salmon et al., 2011), a
-    kind's keyed by its name.
+    The choice of tasks and every kind have their own counter-based generator (Philox; Salmon et al., 2011).
+    The key of a kind's generator depends on the kind's name.
 
     Args:
-        episodes: what there is.
-        request: what a batch takes; at most as many tasks as there are.
-        sequence: addresses the stream of batches.
+        episodes: the episodes.
+        request: the content of a batch; a batch holds all tasks if there are fewer than requested.
+        sequence: seed sequence of the stream of batches.
     """
 
     def __init__(
@@ -110,20 +111,20 @@ class Draws:
         self._block: tuple[int, list[Draw]] = (-1, [])
 
     def num_starts(self, name: str) -> Indices:
-        """(tasks,) valid transitions or windows of each task."""
+        """Number of transitions or windows of every task that may be drawn, (tasks,)."""
         result: Indices = np.diff(self._starts[name][2].task_ranges)[:, 0]
         return result
 
     def __call__(self, n: int) -> Draw:
-        """The rows of batch n."""
+        """The indices of batch n."""
         number, block = self._block
         if number != n // BLOCK:
             number, block = n // BLOCK, self._make(n // BLOCK)
-            self._block = (number, block)  # both at once: another thread may ask for another batch
+            self._block = (number, block)  # one assignment, because threads may draw at the same time
         return block[n % BLOCK]
 
     def _make(self, number: int) -> list[Draw]:
-        """The batches number * BLOCK, …, from uniform numbers in [0, 1) of 53 bits."""
+        """Draws batches number * BLOCK, …, (number + 1) * BLOCK - 1, from 53-bit uniform random numbers."""
         uniform = _generator(self._task_key, number).random((BLOCK, len(self._ranges)))
         tasks: Indices = uniform.argsort(axis=1)[:, : self.num_tasks].astype(np.int64)
         picks: dict[str, list[Indices]] = {}
@@ -146,12 +147,12 @@ class Draws:
 
 
 def _order_of(name: str, kind: Trajectories) -> tuple[str, int]:
-    """The kind whose order of episodes a kind reads, and how many of its places must be filled."""
+    """The kind whose order of episodes a kind reads, and the number of places that it needs."""
     return kind.apart_from or name, places_filled(kind.number, from_back=kind.apart_from is not None)
 
 
 def _key(sequence: np.random.SeedSequence, *names: str) -> Key:
-    """The generator's key of a purpose under the stream of batches."""
+    """The key of the generator for a purpose, given the seed sequence of the stream."""
     entries = [int.from_bytes(hashlib.sha256(name.encode()).digest()[:4], "big") for name in names]
     own = np.random.SeedSequence(sequence.entropy, spawn_key=(*sequence.spawn_key, *entries))
     return own.generate_state(2, np.uint64)

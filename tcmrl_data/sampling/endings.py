@@ -1,4 +1,4 @@
-"""What lies between a step and the end of its episode: returns to go, discounts, last observations."""
+"""Returns to go, discounts and final observations of steps."""
 
 from dataclasses import dataclass, replace
 
@@ -13,13 +13,13 @@ CHUNK_ROWS = 2**16
 
 @dataclass(frozen=True)
 class Endings:
-    """Returns to go of packed rows, four bytes per row; all else follows from where episodes lie.
+    """Returns to go of packed rows; the other values are computed from the positions of episodes.
 
     Attributes:
         rows: the packed selection.
-        returns_to_go: (rows,) discounted sum of the rewards from each step to its episode's end; 0 where a
-            row is no step.
-        discounts: (longest episode + 1,) powers of gamma from gamma^0 on.
+        returns_to_go: (rows,) discounted sum of rewards from a step to the end of its episode; 0 for rows
+            that are not steps.
+        discounts: (longest episode + 1,) powers of gamma, from gamma^0.
     """
 
     rows: PackedRows
@@ -28,7 +28,7 @@ class Endings:
 
     @classmethod
     def of(cls, rows: PackedRows, gamma: float) -> "Endings":
-        """Those of a discount factor, computed in double precision from chunks of whole episodes."""
+        """Computes the endings for a discount factor, in double precision and chunks of whole episodes."""
         episodes, returns = rows.episodes, np.zeros(len(rows.table), dtype=np.float32)
         ends = episodes.starts + episodes.lengths
         first = 0
@@ -44,11 +44,11 @@ class Endings:
         return cls(rows, returns, discounts.astype(np.float32))
 
     def attach(self, steps: Steps, first_rows: Indices) -> Steps:
-        """Steps with their endings, zero on padding.
+        """The steps with their returns to go and other endings; endings are zero on padding.
 
         Args:
             steps: transitions (tasks, number), or windows or trajectories (tasks, number, length).
-            first_rows: (tasks, number) rows where they start.
+            first_rows: (tasks, number) first rows of the transitions, windows or trajectories.
         """
         rows, shape = self.rows, steps.rewards.shape
         length = 1 if len(shape) == 2 else shape[-1]
@@ -74,12 +74,12 @@ class Endings:
 def _returns_to_go(
     rewards: np.typing.NDArray[np.float64], episodes: Episodes, gamma: float
 ) -> np.typing.NDArray[np.float64]:
-    """(rows,) G_t = r_t + gamma G_{t+1}, with G_T = 0, for all episodes at once from their ends."""
+    """G_t = r_t + gamma G_{t+1} with G_T = 0, (rows,); computed backwards in t for all episodes together."""
     result = np.zeros(len(rewards))
-    rest = np.zeros(len(episodes.starts))
+    returns = np.zeros(len(episodes.starts))
     for t in range(episodes.longest - 1, -1, -1):
-        live = np.flatnonzero(episodes.lengths > t)
-        places = episodes.starts[live] + t
-        rest[live] = rewards[places] + gamma * rest[live]
-        result[places] = rest[live]
+        active = np.flatnonzero(episodes.lengths > t)
+        rows = episodes.starts[active] + t
+        returns[active] = rewards[rows] + gamma * returns[active]
+        result[rows] = returns[active]
     return result

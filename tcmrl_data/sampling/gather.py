@@ -1,4 +1,4 @@
-"""From rows to a batch: one gather of blocks of rows per kind, into memory that is used again."""
+"""Gathers the rows of a batch, with one gather per kind, into reused memory."""
 
 import weakref
 from collections import deque
@@ -15,27 +15,27 @@ from tcmrl_data.sampling.request import BatchRequest, Kind, Trajectories, Transi
 from tcmrl_data.sampling.rows import Indices, PackedRows, Table
 
 SPARE_BUFFERS = 8
-"""Buffers kept for later batches; more exist while more batches are held."""
+"""Maximum number of unused buffers kept for later batches."""
 
 PINNED_BUFFERS = 4
 DEVICE_SHARE = 0.5
-"""Of a device's free memory, the most that rows may take there."""
+"""Maximum share of a device's free memory for rows."""
 
 _Field = tuple[tuple[int, ...], tuple[int, ...], int]
-"""Size, strides and offset of a view."""
+"""Shape, strides and offset of a view."""
 
 _Fields = tuple[list[_Field], Tensor]
-"""The fields of steps in their order, and the mask."""
+"""The first five fields of `Steps`, and the mask."""
 
 
 @dataclass(frozen=True)
 class _Block:
-    """Where a kind lies in a buffer, whatever its number in a batch.
+    """Position of a kind in a buffer; does not depend on the number drawn for a batch.
 
     Attributes:
-        kind: what is gathered.
-        view: the table's stretches of the kind's length, by their first row.
-        offset: floats before it.
+        kind: the requested kind.
+        view: (rows, floats) overlapping blocks of the table; row i is the block that starts at row i.
+        offset: number of floats in front of the kind.
     """
 
     kind: Kind
@@ -44,18 +44,18 @@ class _Block:
 
 
 class Gatherer:
-    """Fetches a drawn batch.
+    """Gathers batches, given their indices.
 
-    K steps and the observation behind them are one stretch of the table, so a view whose rows overlap
-    (row i: the block that starts at row i) gives a transition, a window or a trajectory by one index.
+    K steps and the observation after them are one contiguous block of the table. In a view with overlapping
+    rows (row i is the block that starts at row i), one index selects a transition, window or trajectory.
 
     Args:
         rows: the packed selection.
-        table: their table, in the memory of this machine or on the device.
-        request: what a batch holds.
+        table: the table of the rows, in host memory or on the device.
+        request: the content of a batch.
         num_tasks: tasks per batch.
-        device: where batches are to be.
-        endings: of the rows, where a kind wants returns.
+        device: device of the batches.
+        endings: endings of the rows; needed if a kind is requested with `returns=True`.
     """
 
     def __init__(
@@ -86,13 +86,13 @@ class Gatherer:
         self._layouts: dict[tuple[str, int], _Fields | Steps] = {}
 
     def _floats(self, kind: Kind) -> int:
-        """Floats of one transition, window or trajectory with the observation behind it."""
+        """Number of floats of one transition, window or trajectory, with the observation after it."""
         if isinstance(kind, Trajectories):
             return (self._longest + 1) * self._width
         return kind.length * self._width + self._rows.observation_dim
 
     def __call__(self, draw: Draw) -> Batch:
-        """The batch of a draw, on the device."""
+        """Gathers the batch of a draw on the device."""
         memory = self._buffers.take()
         rows = {name: self._first_rows(name, picks) for name, picks in draw.picks.items()}
         masks = {name: self._gather(memory, block, rows[name]) for name, block in self._blocks.items()}
@@ -112,7 +112,7 @@ class Gatherer:
         return self._rows.episodes.starts[picks] if is_trajectory else picks
 
     def _gather(self, memory: Tensor, block: _Block, rows: Indices) -> Tensor | None:
-        """Copies a kind into the buffer; returns its mask where some of it is padding."""
+        """Copies a kind into the buffer; returns its mask, or None if nothing is padding."""
         floats = block.view.shape[1]
         out = memory[block.offset : block.offset + rows.size * floats].view(rows.size, floats)
         if rows.size:
@@ -122,7 +122,7 @@ class Gatherer:
         return self._clear_padding(out, rows) if is_padded else None
 
     def _clear_padding(self, out: Tensor, rows: Indices) -> Tensor:
-        """(tasks, number, longest episode) mask; clears what was gathered beyond an episode."""
+        """Sets padding to zero; returns the mask (tasks, number, longest episode)."""
         episodes = self._rows.episodes
         drawn = np.searchsorted(episodes.starts, rows)
         lengths = torch.from_numpy(episodes.lengths[drawn]).to(out.device)[..., None]
@@ -132,7 +132,7 @@ class Gatherer:
         return (t[:-1] < lengths).to(self._device)
 
     def _layout(self, name: str, number: int) -> _Fields | Steps:
-        """Where a kind's fields lie, or what they are where it is empty."""
+        """Views of a kind's fields in a buffer, or the empty steps if `number` is 0."""
         if (name, number) not in self._layouts:
             block = self._blocks[name]
             floats = block.view.shape[1]
@@ -145,7 +145,7 @@ class Gatherer:
         return self._layouts[name, number]
 
     def _fields(self, shape: tuple[int, ...], strides: tuple[int, ...], offset: int) -> _Fields | Steps:
-        """Where the fields of steps lie whose rows lie in a buffer from an offset on, and a full mask."""
+        """Views of the fields of steps with rows at an offset in a buffer, and a mask of ones."""
         observation_dim, action_dim = self._rows.observation_dim, self._rows.action_dim
         last = offset + self._width - 1
         vectors, rows = (*shape, observation_dim), (*strides, 1)
@@ -169,22 +169,22 @@ def _steps(memory: Tensor, fields: list[_Field], mask: Tensor) -> Steps:
 
 
 def place_table(table: Table, device: torch.device) -> Tensor:
-    """The table on the device where it takes at most half of the free memory there, else where it is."""
-    found = torch.from_numpy(table)
-    if device.type == "cuda" and found.nbytes <= DEVICE_SHARE * torch.cuda.mem_get_info(device)[0]:
-        return found.to(device)
-    return found
+    """The table on a CUDA device if it takes at most half of the free memory there, else in host memory."""
+    tensor = torch.from_numpy(table)
+    if device.type == "cuda" and tensor.nbytes <= DEVICE_SHARE * torch.cuda.mem_get_info(device)[0]:
+        return tensor.to(device)
+    return tensor
 
 
 def _overlapping(table: Tensor, floats: int) -> Tensor:
-    """(rows, floats): the block of that many floats from each row on that has one."""
+    """A view (blocks, floats) of the table; block i starts at row i, and blocks overlap."""
     width = table.shape[1]
     rows = max(0, (table.numel() - floats) // width + 1)
     return table.as_strided((rows, floats), (width, 1))
 
 
 class _HostBuffers:
-    """Memory that comes back by itself when the last tensor over it is gone."""
+    """Host memory that is reused when its last tensor is deleted."""
 
     def __init__(self, floats: int, device: torch.device) -> None:
         self._floats, self._device = floats, device
@@ -195,7 +195,7 @@ class _HostBuffers:
             memory = self._spare.pop()
         except IndexError:
             memory = np.empty(self._floats, dtype=np.float32)
-        lease = memory[:]  # a new object over the same memory, which torch holds as long as it needs it
+        lease = memory[:]  # a new view; torch keeps it alive as long as a tensor uses the memory
         weakref.finalize(lease, self._spare.append, memory).atexit = False
         return torch.from_numpy(lease)
 
@@ -204,7 +204,7 @@ class _HostBuffers:
 
 
 class _DeviceBuffers:
-    """Memory of the device, where its own allocator uses it again."""
+    """Memory of the device, reused by torch's allocator."""
 
     def __init__(self, floats: int, device: torch.device) -> None:
         self._floats, self._device = floats, device
@@ -217,7 +217,7 @@ class _DeviceBuffers:
 
 
 class _PinnedBuffers:
-    """Page-locked memory, copied to the device without waiting; filled again once it has been copied."""
+    """Page-locked memory, copied to the device asynchronously and reused after the copy."""
 
     def __init__(self, floats: int, device: torch.device) -> None:
         self._device = device
@@ -228,7 +228,7 @@ class _PinnedBuffers:
 
     def take(self) -> Tensor:
         memory, copied = self._free.popleft()
-        copied.synchronize()  # the oldest copy: long done
+        copied.synchronize()  # the oldest copy; usually complete
         self._copied[memory.data_ptr()] = copied
         return memory
 

@@ -1,4 +1,4 @@
-"""Statistics of packed rows, gathered chunk by chunk so that no more than a chunk is ever copied."""
+"""Statistics of packed rows, computed chunk by chunk to save memory."""
 
 import numpy as np
 import numpy.typing as npt
@@ -13,7 +13,7 @@ Values = npt.NDArray[np.float64]
 
 
 def moments_of(rows: PackedRows) -> Moments:
-    """Statistics over all transitions of the rows, in double precision."""
+    """Statistics of all transitions of the rows, computed in double precision."""
     table, episodes = rows.table, rows.episodes
     stop = int(episodes.starts[-1] + episodes.lengths[-1])
     width, total = rows.observation_dim, _Sums(2 * rows.observation_dim + rows.action_dim + 1)
@@ -42,7 +42,7 @@ def moments_of(rows: PackedRows) -> Moments:
 
 
 def _is_step(episodes: Episodes, first: int, last: int) -> npt.NDArray[np.bool_]:
-    """Which of the rows first to last - 1 are transitions, and no episode's last row."""
+    """Whether rows first to last - 1 are transitions, (last - first,); the others are last observations."""
     rows = np.arange(first, last)
     latest = np.searchsorted(episodes.starts, rows, side="right") - 1
     ends = episodes.starts[latest] + episodes.lengths[latest]
@@ -61,9 +61,10 @@ class _Sums:
         if not len(values):
             return
         count, mean = self.count + len(values), values.mean(axis=0)
-        gap = mean - self.mean
-        self._squares += np.square(values - mean).sum(axis=0) + gap**2 * self.count * len(values) / count
-        self.mean = self.mean + gap * len(values) / count
+        difference = mean - self.mean
+        between = difference**2 * self.count * len(values) / count
+        self._squares += np.square(values - mean).sum(axis=0) + between
+        self.mean = self.mean + difference * len(values) / count
         self.least, self.most = (
             np.minimum(self.least, values.min(axis=0)),
             np.maximum(self.most, values.max(axis=0)),

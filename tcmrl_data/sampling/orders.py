@@ -1,9 +1,9 @@
-"""Random orders of a task's episodes, read from both ends without computing their middle.
+"""Random orders (permutations) of a task's episodes, of which only both ends are computed.
 
-An order's places are filled from the outside in: first, last, second, last but one, and so on, each with an
-episode that is uniform over those not yet placed. Every order is equally likely, and what stands at a place
-depends on the random numbers of the places filled before it alone. Two kinds that read one order from its two
-ends therefore never meet, and neither's number changes what the other reads.
+The places of an order are filled from the outside in: first, last, second, second to last, and so on. The
+episode at a place is uniform over the episodes not yet placed, so all orders are equally likely, and it
+depends only on the random numbers of this place and of the places filled before. Two kinds that read one
+order from its two ends share no episode, and the number of one kind does not change the draws of the other.
 """
 
 import numpy as np
@@ -15,16 +15,20 @@ Uniform = npt.NDArray[np.float64]
 
 
 def places_filled(number: int, *, from_back: bool) -> int:
-    """How many places must be filled to read `number` episodes from one end."""
+    """The number of places to fill in order to read `number` episodes from one end."""
     return max(0, 2 * number - 1 + from_back)
 
 
 def fill_places(counts: Indices, uniform: Uniform) -> Indices:
-    """(places, ...) episodes in the sequence in which places are filled; meaningless beyond `counts`.
+    """Fills the outer places of orders.
 
     Args:
-        counts: (...) episodes of each order.
-        uniform: (places, ...) in [0, 1); the k-th picks among what the first k - 1 left.
+        counts: (...) number of episodes of every order.
+        uniform: (places, ...) uniform random numbers in [0, 1).
+
+    Returns:
+        (places, ...) episodes in the sequence in which places are filled; entry k is not defined if k is
+        not below an order's count.
     """
     places = len(uniform)
     found = np.empty(uniform.shape, dtype=np.int64)
@@ -32,7 +36,7 @@ def fill_places(counts: Indices, uniform: Uniform) -> Indices:
     before = np.arange(places).reshape(places, *[1] * counts.ndim)
     for k in range(places):
         pick = below(uniform[k], np.maximum(counts - k, 1))
-        if k:  # step over every taken episode with at most `pick` free ones before it
+        if k:  # skip every taken episode that has at most `pick` free episodes before it
             pick += (taken[:k] - before[:k] <= pick).sum(axis=0)
         found[k] = pick
         taken[1 : k + 1] = np.minimum(np.maximum(taken[:k], pick), taken[1 : k + 1])
@@ -41,13 +45,13 @@ def fill_places(counts: Indices, uniform: Uniform) -> Indices:
 
 
 def read_end(filled: Indices, counts: Indices, number: int, *, from_back: bool) -> Indices:
-    """(..., number) episodes from one end of every order, the outermost first.
+    """Reads episodes (..., number) from one end of every order, the outermost episode first.
 
     Args:
-        filled: what `fill_places` gave, of at least `places_filled(number)` places or all.
-        counts: (...) episodes of each order, at least `number`.
-        number: how many to read.
-        from_back: which end.
+        filled: the result of `fill_places`, with at least `places_filled(number)` places or with all places.
+        counts: (...) number of episodes of every order, at least `number`.
+        number: number of episodes to read.
+        from_back: reads from the back if True, from the front otherwise.
     """
     inwards = np.arange(number).reshape(number, *[1] * counts.ndim)
     place = 2 * inwards + from_back
@@ -57,6 +61,6 @@ def read_end(filled: Indices, counts: Indices, number: int, *, from_back: bool) 
 
 
 def below(uniform: Uniform, counts: Indices | int) -> Indices:
-    """Integers below the counts; the product of a float below 1 and a count never rounds up to the count."""
+    """Random integers in [0, counts); a float below 1 times a count never rounds up to the count."""
     result: Indices = (uniform * counts).astype(np.int64)
     return result

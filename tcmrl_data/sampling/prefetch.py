@@ -1,4 +1,4 @@
-"""Making things ahead of their use, by one thread and never more than a few."""
+"""Prefetching of items by one thread."""
 
 import threading
 import time
@@ -12,18 +12,18 @@ Item = TypeVar("Item")
 
 @final
 class Prefetch(Generic[Item]):
-    """The items of some numbers, in their order, made ahead by one thread; a context manager.
+    """An iterator over items that one thread makes ahead of their use; a context manager.
 
-    Leaving the context ends the thread. What making an item raises is raised where that item is asked
-    for, after the items before it.
+    Leaving the context ends the thread. An exception raised by `make` is raised again by the iterator, in
+    the place of the item.
 
     Attributes:
-        waited: seconds that asking for items took so far.
+        waited: total time in seconds that `next` took so far.
 
     Args:
-        make: gives the item of a number; called in another thread.
-        numbers: which items.
-        depth: items that wait at most; 0 makes each when it is asked for, without a thread.
+        make: makes the item with a given number; called in another thread.
+        numbers: numbers of the items, in order.
+        depth: maximum number of items made ahead; 0 makes an item when it is needed, without a thread.
 
     Example:
         >>> with Prefetch(lambda n: n * n, range(3), depth=2) as squares:
@@ -85,8 +85,8 @@ class Prefetch(Generic[Item]):
                         return
                     self._ready.append(item)
                     self._changed.notify_all()
-                del item  # a buffer must not stay in use while the next one is made
-        except Exception as error:  # noqa: BLE001 - whatever it is, it is raised again where it is waited for
+                del item  # releases the item's buffer before the next item is made
+        except Exception as error:  # noqa: BLE001 - any exception is raised again in the consumer's thread
             self._problem = error
         finally:
             with self._changed:

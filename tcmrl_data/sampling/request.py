@@ -1,4 +1,4 @@
-"""What a batch must hold: kinds of data by name."""
+"""Batch requests: the content of a batch, as kinds of data by name."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -9,11 +9,11 @@ from tcmrl_data.foundation.errors import RequestError
 
 @dataclass(frozen=True)
 class Transitions:
-    """Single transitions, uniform over all of a task, with replacement.
+    """Single transitions, drawn uniformly from all transitions of a task, with replacement.
 
     Attributes:
         number: transitions per task.
-        returns: whether steps carry their returns to go and what belongs to them.
+        returns: whether steps include returns to go, discounts, final observations and times.
     """
 
     length: ClassVar[int] = 1
@@ -23,15 +23,15 @@ class Transitions:
 
 @dataclass(frozen=True, init=False)
 class Trajectories:
-    """Whole episodes, uniform over all of a task, without replacement.
+    """Whole episodes, drawn uniformly from all episodes of a task, without replacement.
 
     Attributes:
         numbers: episodes per task; one of these numbers is drawn for every batch.
-        apart_from: the kind of trajectories with which this one shares no episode of a batch.
-        returns: whether steps carry their returns to go and what belongs to them.
+        apart_from: name of another kind of trajectories; a batch has no episode in both kinds.
+        returns: whether steps include returns to go, discounts, final observations and times.
 
     Args:
-        numbers: several numbers, or the only one.
+        numbers: one number or several numbers.
         apart_from: as above.
         returns: as above.
     """
@@ -49,18 +49,18 @@ class Trajectories:
 
     @property
     def number(self) -> int:
-        """The most episodes per task that a batch may hold."""
+        """The maximum number of episodes per task."""
         return max(self.numbers, default=0)
 
 
 @dataclass(frozen=True)
 class Windows:
-    """Stretches of consecutive transitions inside one episode, uniform over all of a task, with replacement.
+    """Consecutive transitions of one episode, drawn uniformly from all windows of a task, with replacement.
 
     Attributes:
         number: windows per task.
         length: transitions per window.
-        returns: whether steps carry their returns to go and what belongs to them.
+        returns: whether steps include returns to go, discounts, final observations and times.
     """
 
     number: int
@@ -73,18 +73,17 @@ Kind: TypeAlias = Transitions | Trajectories | Windows
 
 @dataclass(frozen=True)
 class BatchRequest:
-    """What every batch of a sampler holds.
+    """The content of a sampler's batches.
 
     Attributes:
-        tasks: tasks per batch, drawn without replacement; all selected tasks where there are fewer.
-        kinds: what is drawn of every task, by a name of the method's choice. A kind of number 0 is left out.
-            A kind's draws depend on its name; other kinds never change them.
+        tasks: tasks per batch, drawn without replacement; a batch holds all selected tasks if they are fewer.
+        kinds: kinds of data to draw for every task, by names that the method chooses. A kind with number 0
+            is omitted. A kind's draws depend on its name and not on other kinds.
         gamma: discount factor of the returns to go.
 
     Raises:
-        RequestError: a number that is negative or missing, a length below 1, or an `apart_from` that names
-            no other kind of trajectories, one that is itself apart from another, or one that is taken; a
-            gamma outside [0, 1].
+        RequestError: a number is negative or missing, a window's length is below 1, gamma lies outside
+            [0, 1], or `apart_from` does not name another kind of trajectories, or joins more than two kinds.
 
     Example:
         >>> request = BatchRequest(
@@ -127,7 +126,7 @@ def _check_numbers(name: str, kind: Kind) -> None:
 
 
 def _check_partners(kinds: Mapping[str, Kind]) -> None:
-    """Two kinds share the episodes of a task from both ends, so that a third finds no end."""
+    """Checks that `apart_from` joins two kinds; they read one order from its two ends."""
     pairs = {
         name: kind.apart_from
         for name, kind in kinds.items()

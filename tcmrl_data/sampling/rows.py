@@ -1,4 +1,4 @@
-"""Packed rows: all selected steps in one float32 table, read part by part, several parts at a time."""
+"""Packed rows: all selected steps in one float32 table."""
 
 import os
 from collections.abc import Callable, Iterator, Sequence
@@ -21,17 +21,17 @@ Table = npt.NDArray[np.float32]
 
 ROW_ARRAYS = ("observations", "actions", "rewards", "terminated", "episode_offsets")
 READERS = 8
-"""Most parts that are read at the same time; each holds its files and its arrays in memory."""
+"""Maximum number of parts that are read at the same time; limits memory."""
 
 
 @dataclass(frozen=True)
 class Episodes:
-    """Where the episodes of a selection lie; those without a step are left out.
+    """Positions of a selection's episodes, without episodes that have no step.
 
     Attributes:
-        starts: (episodes,) first row of each.
-        lengths: (episodes,) steps of each, at least 1.
-        task_ranges: (tasks, 2) first and last + 1 of each task's episodes.
+        starts: (episodes,) first row of every episode.
+        lengths: (episodes,) number of steps, at least 1.
+        task_ranges: (tasks, 2) first episode and last episode + 1 of every task.
     """
 
     starts: Indices
@@ -40,37 +40,38 @@ class Episodes:
 
     @classmethod
     def of(cls, lengths: Sequence[Indices], tasks: Sequence[int]) -> "Episodes":
-        """The table of episodes whose rows lie behind one another.
+        """The positions of episodes with consecutive rows.
 
         Args:
-            lengths: of each part's episodes.
-            tasks: position of each part's task, ascending.
+            lengths: per part, the lengths of its episodes.
+            tasks: per part, the position of its task; ascending.
         """
         flat = np.concatenate(lengths)
         starts = np.cumsum(flat + 1) - flat - 1
-        owner = np.repeat(tasks, [len(each) for each in lengths])[flat > 0]
+        owner = np.repeat(tasks, [len(part) for part in lengths])[flat > 0]
         positions = np.arange(max(tasks) + 1)
         ranges = np.stack([np.searchsorted(owner, positions, side) for side in ("left", "right")], axis=1)
         return cls(starts[flat > 0], flat[flat > 0], ranges.astype(np.int64))
 
     @property
     def longest(self) -> int:
-        """Steps of the longest episode; 0 where there is none."""
+        """Number of steps of the longest episode; 0 if there are no episodes."""
         return int(self.lengths.max(initial=0))
 
 
 @dataclass(frozen=True)
 class PackedRows:
-    """All steps of a selection, a row per observation: (observation, action, reward, terminated).
+    """All steps of a selection; a row is (observation, action, reward, terminated).
 
-    An episode of T steps takes T + 1 rows, so the next observation is the next row; the last row of an
-    episode holds an observation and zeros. At least as many rows of zeros as the longest episode has steps
-    lie behind the last one, so that a block of that length may start at any episode.
+    An episode of T steps has T + 1 rows, so that the next observation is in the next row; the last row of an
+    episode holds an observation and zeros. After the last episode follow at least as many rows of zeros as
+    the longest episode has steps, so that a block of that length can start at any episode.
 
     Attributes:
         table: (rows, observation_dim + action_dim + 2).
-        episodes: where they lie.
-        observation_dim, action_dim: widths.
+        episodes: positions of the episodes in the table.
+        observation_dim: width of observations.
+        action_dim: width of actions.
         task_indices: (tasks,) indices of the tasks.
     """
 
@@ -83,12 +84,13 @@ class PackedRows:
 
 @dataclass(frozen=True)
 class PartRows:
-    """The rows that one part fills.
+    """The rows of one part.
 
     Attributes:
-        folder: the part.
-        task: position of its task in the selection.
-        first, last: its rows are `first` to `last - 1`.
+        folder: the part's folder.
+        task: position of the part's task in the selection.
+        first: its first row.
+        last: its last row + 1.
     """
 
     folder: Path
@@ -98,10 +100,10 @@ class PartRows:
 
 
 def plan_rows(selection: "Selection") -> list[PartRows]:
-    """The parts of a selection and the rows that each will fill, from their records alone.
+    """Plans the rows of a selection's parts; reads the parts' records only.
 
     Raises:
-        StoreError: a part whose observations or actions are not as wide as the environment's.
+        StoreError: the observations or actions of a part do not have the environment's width.
     """
     dataset, plan, first = selection.dataset, [], 0
     widths = {
@@ -127,7 +129,7 @@ def plan_rows(selection: "Selection") -> list[PartRows]:
 
 
 def table_shape(selection: "Selection", plan: Sequence[PartRows]) -> tuple[int, int]:
-    """Shape of a selection's table; no episode is longer than the largest part has rows."""
+    """Shape of a selection's table; its padding is as long as the largest part, hence as any episode."""
     environment = selection.dataset.environment
     padding = max(part.last - part.first for part in plan)
     return plan[-1].last + padding, environment.observation_dim + environment.action_dim + 2
@@ -137,7 +139,7 @@ def read_rows(selection: "Selection") -> PackedRows:
     """Reads a selection into memory.
 
     Raises:
-        StoreError: arrays that do not decode or do not form episodes; names the part.
+        StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
     """
     plan = plan_rows(selection)
     table: Table = np.zeros(table_shape(selection, plan), dtype=np.float32)
@@ -146,23 +148,23 @@ def read_rows(selection: "Selection") -> PackedRows:
 
 
 def selection_rows(selection: "Selection", table: Table, episodes: Episodes) -> PackedRows:
-    """The rows of a selection, given the filled table."""
+    """The packed rows of a selection, given the filled table."""
     environment = selection.dataset.environment
     indices = np.array([task.index for task in selection.tasks], dtype=np.int64)
     return PackedRows(table, episodes, environment.observation_dim, environment.action_dim, indices)
 
 
 def each_part(plan: Sequence[PartRows], read: Callable[[PartRows], Any]) -> Iterator[Any]:
-    """What `read` gives for every part, in order; the first part that fails, fails all."""
+    """Yields the results of `read` for all parts, in order; several threads read at the same time."""
     with ThreadPoolExecutor(min(READERS, len(os.sched_getaffinity(0)))) as pool:
         yield from pool.map(read, plan)
 
 
 def read_part(part: PartRows, out: Table) -> Indices:
-    """Fills zeroed rows with a part; returns the lengths of its episodes.
+    """Reads a part into rows of zeros; returns the lengths of its episodes.
 
     Raises:
-        StoreError: arrays that do not decode or do not form episodes; names the part.
+        StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
     """
     arrays = read_arrays(part.folder, ROW_ARRAYS)
     try:
@@ -172,14 +174,14 @@ def read_part(part: PartRows, out: Table) -> Indices:
 
 
 def fill_rows(out: Table, arrays: Arrays) -> Indices:
-    """Writes a part's arrays into its rows, which are zeros; returns the lengths of its episodes.
+    """Writes a part's arrays into rows of zeros; returns the lengths of its episodes.
 
     Args:
-        out: (observations, width).
-        arrays: as the store has them.
+        out: (observations, width), the part's rows.
+        arrays: the part's arrays.
 
     Raises:
-        StoreError: they do not form episodes, or not as many rows.
+        StoreError: the arrays do not form episodes, or do not have as many observations as `out` has rows.
     """
     observations, actions = arrays["observations"], arrays["actions"]
     offsets = checked_offsets(arrays["episode_offsets"], len(actions))
@@ -192,9 +194,8 @@ def fill_rows(out: Table, arrays: Arrays) -> Indices:
         if len(arrays[name]) != len(actions):
             raise StoreError(f"{name} has {len(arrays[name])} steps, actions have {len(actions)}")
     observation_dim = observations.shape[1]
-    steps = np.arange(len(actions)) + np.repeat(
-        np.arange(len(lengths)), lengths
-    )  # each episode's last row is none
+    # an episode has one row more than steps
+    steps = np.arange(len(actions)) + np.repeat(np.arange(len(lengths)), lengths)
     out[:, :observation_dim] = observations
     out[steps, observation_dim:-2] = actions
     out[steps, -2] = arrays["rewards"]

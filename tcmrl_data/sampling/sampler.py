@@ -1,4 +1,4 @@
-"""Meta-training batches: draws, then one gather per kind."""
+"""The sampler of meta-training batches."""
 
 import copy
 from collections.abc import Callable
@@ -36,16 +36,16 @@ def open_sampler(
 
     Args:
         selection: training tasks and snapshots.
-        request: what a batch holds.
-        seed: of the run; batch n is a function of (seed, stream, n).
-        stream: further streams of batches under the same seed.
-        device: where batches are to be.
-        memory_limit: bytes that the decoded steps may take in memory, half of what is available if left
-            out; larger selections are decoded into the cache once and read from there.
-        say: told when the cache is used.
+        request: the content of a batch.
+        seed: seed of the run; batch n is a function of (seed, stream, n).
+        stream: number of the stream; streams with the same seed are independent.
+        device: device of the batches.
+        memory_limit: maximum size of the decoded steps in memory, in bytes; None for half of the available
+            memory. Larger selections are decoded into the cache once and read from there.
+        say: called with a message if the cache is used.
 
     Raises:
-        SelectionError: the selection holds test tasks, fewer than two tasks, or too little of one.
+        SelectionError: the selection holds test tasks, fewer than two tasks, or too little data of a task.
 
     Example:
         >>> request = BatchRequest(tasks=16, kinds={"context": Trajectories(2)})
@@ -74,26 +74,26 @@ def open_sampler(
 class Sampler:
     """Serves batch n as a pure function of (seed, stream, n); made by `open_sampler`.
 
-    Within a batch, tasks are drawn without replacement; within a task, transitions and windows uniformly
-    over all valid ones (with replacement), trajectories uniformly without replacement. Tasks and every kind
-    have random streams of their own, a kind's keyed by its name: no kind changes the draws of another.
-    Episodes without a step are never drawn, episodes shorter than a window hold none. Task parameters are
-    never loaded.
+    A batch draws tasks without replacement. Within a task it draws transitions and windows uniformly with
+    replacement, and trajectories uniformly without replacement. The choice of tasks and every kind have
+    their own random streams, so that a kind does not change the draws of another kind. Episodes without a
+    step are never drawn, and episodes shorter than a window contain no window. Task parameters are never
+    loaded.
 
-    On a CUDA device the rows live there if they take at most half of its free memory; otherwise batches
-    are gathered in page-locked memory and copied without blocking.
+    With a CUDA device, rows are stored on the device if they take at most half of its free memory;
+    otherwise batches are gathered in page-locked memory and copied asynchronously.
 
     Attributes:
-        request: what a batch holds.
-        device: where batches are.
+        request: the content of a batch.
+        device: device of the batches.
 
     Args:
         rows: the packed selection.
-        request: what a batch holds.
-        seed: of the run.
-        stream: further streams of the same seed, independent of each other.
-        environment: its name, part of the seed's key.
-        place: names the selection in errors.
+        request: the content of a batch.
+        seed: seed of the run.
+        stream: number of the stream; streams with the same seed are independent.
+        environment: the environment's name, part of the seed's key.
+        place: name of the selection in error messages.
         device: a torch device.
 
     Raises:
@@ -137,7 +137,7 @@ class Sampler:
         )
 
     def with_request(self, request: BatchRequest) -> Self:
-        """A sampler of the same steps, seed and stream for another request; nothing is loaded again.
+        """A sampler for another request with the same steps, seed and stream; loads nothing again.
 
         Raises:
             SelectionError: a task has too few steps, trajectories or windows for the request.
@@ -148,11 +148,11 @@ class Sampler:
 
     @property
     def task_indices(self) -> npt.NDArray[np.int64]:
-        """(tasks,) indices of the tasks that batches are drawn from."""
+        """Indices of the selected tasks, (tasks,)."""
         return self._rows.task_indices
 
     def short_trajectories(self, length: int) -> int:
-        """How many trajectories have fewer steps than `length`, and so hold no window of that length."""
+        """The number of trajectories that are too short for a window of `length` steps."""
         return int((self._rows.episodes.lengths < length).sum())
 
     def _check(self) -> None:
@@ -176,19 +176,19 @@ class Sampler:
         )
 
     def batch(self, n: int) -> Batch:
-        """The n-th batch, n >= 0; the same for the same selection, request, seed and stream."""
+        """The n-th batch, n >= 0; depends only on n, the selection, request, seed and stream."""
         return self._gather(self._draws(n))
 
     def prefetch(self, first: int, last: int, *, depth: int = 2) -> Prefetch[Batch]:
-        """Batches `first` to `last - 1`, made ahead by a thread: a context manager and an iterator.
+        """An iterator over batches `first` to `last - 1`, made ahead by a thread; a context manager.
 
         Args:
             first: number of the first batch.
-            last: one beyond the last.
-            depth: batches that wait at most; 0 makes each when it is asked for.
+            last: number of the last batch + 1.
+            depth: maximum number of batches made ahead; 0 makes a batch when it is needed.
         """
         return Prefetch(self.batch, range(first, last), depth=depth)
 
     def moments(self) -> Moments:
-        """Statistics over all selected transitions."""
+        """Statistics of all selected transitions."""
         return moments_of(self._rows)
