@@ -117,6 +117,16 @@ def test_differences_are_paired_by_seed_and_large_common_noise_cancels(trained: 
     assert found.seeds == (1, 2, 3)
 
 
+def test_a_verdict_marks_a_method_that_observes_task_parameters(trained: FinishedRun) -> None:
+    finals = [1.0, 2.0]
+    control = [
+        replace(run, result=run.result.model_copy(update={"privileged": True}))
+        for run in _with_finals(trained, "B", finals)
+    ]
+    found = _judge(Claim(text="", better="A", worse="B"), [*_with_finals(trained, "A", finals), *control])
+    assert found.comparison == "A (final) against B (privileged) (final), offline"
+
+
 def test_one_method_under_two_metrics_makes_a_claim(trained: FinishedRun) -> None:
     claim = Claim(text="", better="TCMRL", worse="TCMRL", against="shuffled")
     means = trained.result.evaluations["offline"]
@@ -279,7 +289,7 @@ def test_a_report_without_checkpoints_says_what_is_left_out(copy: Path, call: Ca
     assert code == 0
     assert "cannot tell: TCMRL ends higher (point-robot)" in output
     text = (copy / "report/report.md").read_text()
-    assert "are left out: " in text and "is no run" in text and "Time and memory" in text
+    assert "are omitted: " in text and "is no run" in text and "Time and memory" in text
 
 
 def test_a_report_names_the_runs_that_are_missing_and_why(copy: Path) -> None:
@@ -332,9 +342,11 @@ def test_a_moved_dataset_is_named_with_an_option(
     for file in copied.glob("runs/*.json"):
         file.write_text(json.dumps(json.loads(file.read_text()) | {"dataset": str(tmp_path / "gone")}))
     assert call("report", copied, "--quiet")[0] == 0
-    assert "gone now; name the dataset's new place" in (copied / "report/report.md").read_text()
+    assert (
+        "gone does not exist; name the dataset's present folder" in (copied / "report/report.md").read_text()
+    )
     assert call("report", copied, "--dataset", moved, "--quiet")[0] == 0
-    assert "are left out" not in (copied / "report/report.md").read_text()
+    assert "are omitted" not in (copied / "report/report.md").read_text()
     other = tmp_path / "other"
     (other / "runs").mkdir(parents=True)
     shutil.copy(copied / "experiment.json", other)

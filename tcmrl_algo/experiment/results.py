@@ -107,6 +107,11 @@ class RunResult(_Record):
     evaluation_seconds: float | None
     peak_memory: int | None
 
+    @property
+    def label(self) -> str:
+        """Name of the method in tables and figures, which marks a control that observes task parameters."""
+        return f"{self.method} (privileged)" if self.privileged else self.method
+
     def rows(self) -> list[dict[str, Any]]:
         """Rows of the table, one per protocol."""
         shared = self.model_dump(include=set(COLUMNS))
@@ -128,14 +133,10 @@ def table_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = COLUM
 
 
 def by_method(results: Iterable[RunResult]) -> dict[str, list[RunResult]]:
-    """Results of every method, in the order given, by its label as tables and figures show it.
-
-    The label of a control that sees task parameters says so.
-    """
+    """Results of every method, in the order given, by its `label`."""
     found: dict[str, list[RunResult]] = {}
     for result in results:
-        label = f"{result.method} (privileged)" if result.privileged else result.method
-        found.setdefault(label, []).append(result)
+        found.setdefault(result.label, []).append(result)
     return found
 
 

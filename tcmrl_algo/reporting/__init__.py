@@ -1,1 +1,1 @@
-"""The report on finished runs: tables, figures and a verdict on every claim, from results folders alone."""
+"""Reports on finished runs: tables, figures and a verdict on every claim."""

@@ -1,4 +1,4 @@
-"""Verdicts on an experiment's claims, from differences between methods seed by seed."""
+"""Verdicts on the claims of an experiment, from the differences between two methods seed by seed."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -13,22 +13,22 @@ LOWER_IS_BETTER = frozenset({"regret", "training_seconds", "peak_memory"})
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "cannot tell"
 
 Measure = Callable[[FinishedRun, Metric, str], float | None]
-"""A run's value of a metric under a protocol, None where it has none."""
+"""Returns the value of a run's metric with a protocol, None if it has none."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What the runs say of a claim in one environment.
+    """Verdict on a claim in one environment.
 
     Attributes:
-        claim: in words.
-        environment: where.
-        comparison: what was compared with what.
-        seeds: that both sides have.
-        differences: one per seed, positive where `better` is better.
-        mean: of the differences; None without one.
-        low, high: 95% interval of their mean by Student's t; None under five seeds.
-        verdict: `supported` where the interval lies above 0, `contradicted` where below, else `cannot tell`.
+        claim: text of the claim.
+        environment: name of the environment.
+        comparison: the methods and metrics that were compared; privileged methods are marked.
+        seeds: seeds that both methods have.
+        differences: one per seed, positive if `better` is better.
+        mean: mean of the differences; None if there are none.
+        low, high: 95% interval of the mean by Student's t; None with fewer than five seeds.
+        verdict: `supported` if the interval is above 0, `contradicted` if it is below 0, else `cannot tell`.
     """
 
     claim: str
@@ -49,10 +49,10 @@ def judge(
 
     Args:
         claim: the claim.
-        environment: where.
-        runs: finished there.
-        protocol: used where the claim names none.
-        measure: gives a run's value.
+        environment: name of the environment.
+        runs: finished runs in the environment.
+        protocol: the protocol, unless the claim names one.
+        measure: returns the value of a run's metric.
     """
     protocol, against = claim.protocol or protocol, claim.against or claim.metric
     better = _by_seed(runs, claim.better, claim.metric, protocol, measure)
@@ -61,10 +61,12 @@ def judge(
     sign = -1.0 if claim.metric in LOWER_IS_BETTER else 1.0
     differences = tuple(sign * (better[seed] - worse[seed]) for seed in seeds)
     low, high = mean_interval(differences) or (None, None)
+    labels = {run.result.method: run.result.label for run in runs}
+    left, right = (labels.get(method, method) for method in (claim.better, claim.worse))
     return Verdict(
         claim=claim.text,
         environment=environment,
-        comparison=f"{claim.better} ({claim.metric}) against {claim.worse} ({against}), {protocol}",
+        comparison=f"{left} ({claim.metric}) against {right} ({against}), {protocol}",
         seeds=seeds,
         differences=differences,
         mean=fmean(differences) if differences else None,
@@ -75,12 +77,12 @@ def judge(
 
 
 def measure_result(result: RunResult, metric: Metric, protocol: str) -> float | None:
-    """A metric that the result itself holds; `curve` is the mean over the learning curve's points.
+    """Value of a metric that a result contains; `curve` is the mean over the points of the learning curve.
 
-    `curve` tells sample efficiency; it is by the experiment's first protocol, whatever is asked for.
+    `curve` measures sample efficiency; it always uses the first protocol of the experiment.
     """
     if metric == "curve":
-        return sum(each.final for each in result.curve) / len(result.curve) if result.curve else None
+        return sum(point.final for point in result.curve) / len(result.curve) if result.curve else None
     if metric in ("training_seconds", "peak_memory"):
         value: float | None = getattr(result, metric)
         return value

@@ -1,4 +1,4 @@
-"""What trained contexts look like: how tasks lie apart, and what the attention rests on."""
+"""Contexts and attention weights of finished runs."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -17,22 +17,22 @@ from tcmrl_algo.training.train import create_algorithm
 from tcmrl_data import CheckpointError, Dataset, Task, Trajectory, open_dataset
 
 NUM_TASKS = 20
-"""As many tasks as in the paper's t-SNE figures (Appendix G.7)."""
+"""Number of tasks, as in the paper's t-SNE figures (Appendix G.7)."""
 PER_TASK = 20
-"""Trajectories of each, which make one context each."""
+"""Number of trajectories per task; every trajectory gives one context."""
 FloatArray = npt.NDArray[np.floating[Any]]
 IntArray = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class TransitionWeights:
-    """Attention within single trajectories, times their length: 1 is what even attention would give.
+    """Attention weights in single trajectories, times their length; uniform attention is 1.
 
     Attributes:
-        zero, nonzero: weights of transitions with and without zero reward, from trajectories that hold both.
-        by_step: (steps,), mean over trajectories at every step; NaN where none is that long.
+        zero, nonzero: weights of transitions whose reward is zero or not, from trajectories with both kinds.
+        by_step: (steps,), mean over trajectories at every step; NaN if no trajectory has the step.
         example: weights along one trajectory of a test task.
-        example_rewards: its rewards.
+        example_rewards: rewards of that trajectory.
     """
 
     zero: FloatArray
@@ -44,7 +44,7 @@ class TransitionWeights:
 
 @final
 class Stored:
-    """Trajectories of a dataset that contexts are made of: evenly spaced tasks, evenly spaced episodes."""
+    """Trajectories of a dataset for contexts: evenly spaced episodes of evenly spaced tasks."""
 
     def __init__(self, dataset: Dataset, snapshots: str) -> None:
         tasks = sorted((*dataset.train_tasks, *dataset.test_tasks), key=lambda task: task.index)
@@ -57,13 +57,13 @@ class Stored:
 
     @property
     def lanes(self) -> list[list[Trajectory]]:
-        """Every trajectory alone, task by task."""
-        return [[each] for lane in self.trajectories for each in lane]
+        """One lane per trajectory, ordered by task."""
+        return [[trajectory] for episodes in self.trajectories for trajectory in episodes]
 
     @property
     def labels(self) -> IntArray:
-        """The task of every lane, by its place in `tasks`."""
-        return np.repeat(np.arange(len(self.tasks)), [len(each) for each in self.trajectories])
+        """The task of every lane, as an index into `tasks`."""
+        return np.repeat(np.arange(len(self.tasks)), [len(episodes) for episodes in self.trajectories])
 
 
 @final
@@ -71,11 +71,11 @@ class TrainedContexts:
     """Contexts and attention of one finished run.
 
     Args:
-        run: whose newest checkpoint is read.
-        stored: of the dataset that the run was trained on.
+        run: the run; its newest checkpoint is read.
+        stored: trajectories of the dataset that the run was trained on.
 
     Attributes:
-        labels: (trajectories,) the task of each, by its place among the stored tasks.
+        labels: (trajectories,), task of every trajectory, as an index into the stored tasks.
 
     Raises:
         CheckpointError: the run has no checkpoint, or another dataset.
@@ -92,7 +92,7 @@ class TrainedContexts:
 
     @cached_property
     def contexts(self) -> FloatArray | None:
-        """(trajectories, latent), None for a method without contexts."""
+        """Contexts, (trajectories, latent); None for a method without contexts."""
         if not isinstance(self._algorithm, ContextAlgorithm):
             return None
         found: FloatArray = self._algorithm.context(self._stored.lanes).cpu().numpy()
@@ -100,7 +100,7 @@ class TrainedContexts:
 
     @cached_property
     def weights(self) -> TransitionWeights | None:
-        """None for a method without attention."""
+        """Attention weights; None for a method without attention."""
         attention = attention_of(self._algorithm, self._stored.lanes)
         if attention is None:
             return None
@@ -111,12 +111,14 @@ class TrainedContexts:
         return _transition_weights(rows, self._stored)
 
     def distance_ratio(self) -> float | None:
-        """Mean distance between contexts of one task over that between contexts of two; below 1 is apart."""
+        """Mean distance of contexts of one task over that of contexts of two tasks; None without contexts."""
         return None if self.contexts is None else distance_ratio(self.contexts, self.labels)
 
 
 def distance_ratio(contexts: FloatArray, labels: IntArray) -> float | None:
-    """Mean distance within tasks over mean distance between them; None where all contexts are equal.
+    """Mean distance within tasks over mean distance between tasks; None if all contexts are equal.
+
+    A ratio below 1 means that the tasks are separated.
 
     Example:
         >>> import numpy as np
@@ -131,7 +133,7 @@ def distance_ratio(contexts: FloatArray, labels: IntArray) -> float | None:
 
 
 def embed(contexts: FloatArray) -> FloatArray:
-    """t-SNE (van der Maaten & Hinton, 2008) of contexts, from a fixed start: (points, 2)."""
+    """t-SNE (van der Maaten & Hinton, 2008) of contexts with a fixed initial state, (points, 2)."""
     from sklearn.manifold import TSNE
 
     perplexity = min(30.0, (len(contexts) - 1) / 3)
@@ -141,7 +143,7 @@ def embed(contexts: FloatArray) -> FloatArray:
 
 @final
 class Trained:
-    """Contexts and attention of finished runs, each read once, when first asked for."""
+    """Contexts and attention of finished runs; every run is read once, at its first use."""
 
     def __init__(self) -> None:
         self._stored: dict[tuple[str, str], Stored] = {}
@@ -151,21 +153,21 @@ class Trained:
         """Trajectories of the dataset that a run was trained on.
 
         Raises:
-            TcmrlError: the dataset is no longer where it was.
+            TcmrlError: the dataset was moved or removed.
         """
         place, settings = run.result.dataset, run.result.config.settings.run
         snapshots = settings.context_snapshots or settings.snapshots
         if not Path(place).exists():
-            raise CheckpointError(f"nothing lies at {place} now; name the dataset's new place with --dataset")
+            raise CheckpointError(f"{place} does not exist; name the dataset's present folder with --dataset")
         if (place, snapshots) not in self._stored:
             self._stored[place, snapshots] = Stored(open_dataset(place), snapshots)
         return self._stored[place, snapshots]
 
     def contexts(self, run: FinishedRun) -> TrainedContexts:
-        """A run's contexts and attention.
+        """Contexts and attention of a run.
 
         Raises:
-            TcmrlError: the dataset or the run's checkpoint is no longer where it was.
+            TcmrlError: the dataset or the checkpoint of the run was moved or removed.
         """
         if run.folder not in self._contexts:
             self._contexts[run.folder] = TrainedContexts(run, self.stored(run))
@@ -195,4 +197,4 @@ def _transition_weights(rows: Sequence[FloatArray], stored: Stored) -> Transitio
 
 
 def _spaced(length: int, most: int) -> list[int]:
-    return [int(each) for each in np.linspace(0, length - 1, min(length, most)).round()]
+    return [int(index) for index in np.linspace(0, length - 1, min(length, most)).round()]

@@ -1,4 +1,4 @@
-"""Figures of a report, as PNG files; drawn without a window."""
+"""Figures of a report, drawn to PNG files without a display."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 WIDTH, HEIGHT = 4.6, 3.6
-"""Inches of one panel."""
+"""Size of one panel in inches."""
 
 
 def draw_curves(file: Path, title: str, results: Sequence[RunResult], protocol: str) -> None:
-    """Mean return of the test tasks over training; intervals from five seeds, else the seeds' own lines."""
+    """Mean returns of the test tasks during training; intervals from five seeds on, else a line per seed."""
     figure, (axes,) = _panels(1, width=1.5 * WIDTH)
     for index, (method, runs) in enumerate(by_method(results).items()):
         color = f"C{index % 10}"
         steps = [point.step for point in runs[0].curve]
         finals = [[point.final for point in run.curve] for run in runs]
-        points = [summarize(each) for each in zip(*finals, strict=True)]
-        axes.plot(steps, [each.mean for each in points], "o-", color=color, label=method, markersize=3)
-        lows, highs = [each.low for each in points], [each.high for each in points]
+        points = [summarize(values) for values in zip(*finals, strict=True)]
+        axes.plot(steps, [point.mean for point in points], "o-", color=color, label=method, markersize=3)
+        lows, highs = [point.low for point in points], [point.high for point in points]
         if None not in lows:
             axes.fill_between(steps, lows, highs, color=color, alpha=0.2, linewidth=0)  # type: ignore[arg-type]
         else:
@@ -40,7 +40,7 @@ def draw_curves(file: Path, title: str, results: Sequence[RunResult], protocol: 
 
 
 def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
-    """Final returns per protocol: a line at the mean, dots for seeds, an interval from five seeds."""
+    """Final returns per protocol: a line at the mean, a dot per seed, and an interval from five seeds on."""
     protocols = list(results[0].evaluations)
     figure, panels = _panels(len(protocols))
     methods = by_method(results)
@@ -63,7 +63,7 @@ def draw_embeddings(
     labels: Mapping[str, IntArray],
     is_test: Sequence[bool],
 ) -> None:
-    """t-SNE of contexts, one panel per method and one colour per task; test tasks are triangles."""
+    """t-SNE of contexts: a panel per method, a color per task, triangles for test tasks."""
     figure, panels = _panels(len(points))
     for axes, (method, places) in zip(panels, points.items(), strict=True):
         for task, test in enumerate(is_test):
@@ -75,19 +75,19 @@ def draw_embeddings(
 
 
 def draw_attention(file: Path, weights: Mapping[str, TransitionWeights]) -> None:
-    """Relative attention by step, mean over trajectories; and along one trajectory, beside its rewards."""
+    """Relative attention by step: the mean over trajectories, and one trajectory with its rewards."""
     figure, panels = _panels(1 + len(weights))
     mean, *examples = panels
-    for method, each in weights.items():
-        mean.plot(each.by_step, label=method)
+    for method, method_weights in weights.items():
+        mean.plot(method_weights.by_step, label=method)
     mean.axhline(1.0, color="0.5", linestyle=":")
-    mean.set(xlabel="step", ylabel="weight × steps (even: 1)", title="mean over trajectories")
+    mean.set(xlabel="step", ylabel="weight × steps (uniform: 1)", title="mean over trajectories")
     mean.legend(fontsize="small")
-    for axes, (method, each) in zip(examples, weights.items(), strict=True):
-        axes.bar(range(len(each.example)), each.example, color="C0", alpha=0.6)
+    for axes, (method, method_weights) in zip(examples, weights.items(), strict=True):
+        axes.bar(range(len(method_weights.example)), method_weights.example, color="C0", alpha=0.6)
         axes.set(xlabel="step", ylabel="weight × steps", title=f"{method}: one trajectory")
         rewards = axes.twinx()
-        rewards.plot(each.example_rewards, "C1.-", markersize=3)
+        rewards.plot(method_weights.example_rewards, "C1.-", markersize=3)
         rewards.set_ylabel("reward", color="C1")
     figure.savefig(file, dpi=130)
 
@@ -109,7 +109,7 @@ def _panels(count: int, *, width: float = WIDTH) -> "tuple[Figure, list[Axes]]":
 
 
 def _draw_references(axes: "Axes", result: RunResult) -> None:
-    """Lines of the oracle and of uniform actions, the latter only where it leaves the curves room."""
+    """Lines of the oracle and of uniform actions; the latter only in the legend if far below the curves."""
     tasks = next(iter(result.evaluations.values()))["tasks"]
     low, high = axes.get_ylim()
     for name, label, line in (("oracle", "oracle", "--"), ("random", "uniform actions", ":")):

@@ -1,4 +1,4 @@
-"""Tables of a report, one function each; `write.py` puts them in order."""
+"""Tables of a report, one per function; `write.py` orders them."""
 
 import importlib.resources
 import tomllib
@@ -19,7 +19,7 @@ PARTS = ("final", "shuffled", "regret", "normalized")
 
 
 def final_table(name: str, results: Sequence[RunResult]) -> Table:
-    """Per protocol and method: return after adaptation, under others' contexts, regret, normalised score."""
+    """Return, return with the contexts of other tasks, regret and normalized score by protocol and method."""
     rows: list[tuple[Cell, ...]] = []
     for protocol in results[0].evaluations:
         for method, runs in by_method(results).items():
@@ -31,9 +31,9 @@ def final_table(name: str, results: Sequence[RunResult]) -> Table:
 
 
 def curve_table(name: str, results: Sequence[RunResult]) -> Table:
-    """The learning curves' points, one row per run and step."""
+    """Points of the learning curves, one row per run and step."""
     rows = tuple(
-        (run.method, run.seed, point.step, point.final, point.regret, point.shuffled)
+        (run.label, run.seed, point.step, point.final, point.regret, point.shuffled)
         for run in results
         for point in run.curve
     )
@@ -41,27 +41,27 @@ def curve_table(name: str, results: Sequence[RunResult]) -> Table:
 
 
 def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
-    """Each claim, the mean difference with its interval or seeds, and the verdict."""
+    """Claims with the mean difference, its interval or the seeds' differences, and the verdict."""
     rows: list[tuple[Cell, ...]] = []
-    for each in verdicts:
-        interval = interval_text(each.differences, each.low, each.high) if each.seeds else None
-        numbers = (len(each.seeds), each.mean, interval)
-        rows.append((each.claim, each.environment, each.comparison, *numbers, each.verdict))
+    for found in verdicts:
+        interval = interval_text(found.differences, found.low, found.high) if found.seeds else None
+        numbers = (len(found.seeds), found.mean, interval)
+        rows.append((found.claim, found.environment, found.comparison, *numbers, found.verdict))
     columns = ("claim", "environment", "compared", "seeds", "mean difference", "95% interval", "verdict")
     return Table(name, columns, tuple(rows))
 
 
 def claims_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Table:
-    """`verdict_table` of several experiments together."""
+    """The verdicts on several experiments in one table."""
     tables = {experiment: verdict_table(name, verdicts) for experiment, verdicts in judged.items()}
     rows = tuple((experiment, *row) for experiment, table in tables.items() for row in table.rows)
     return Table(name, ("experiment", *next(iter(tables.values())).columns), rows)
 
 
 def published_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
-    """Scores of the paper's Table 2 beside ours, by the method's name.
+    """Scores of the paper's Table 2 and our returns, matched by the name of the method.
 
-    None where the units differ, or no method of ours is the paper's.
+    None if the units differ, or if the paper has none of our methods.
     """
     scores, ours = published()["returns"].get(environment, {}), by_method(results)
     if not scores.keys() & ours.keys():
@@ -74,13 +74,13 @@ def published_table(name: str, environment: str, results: Sequence[RunResult]) -
             finals = [run.evaluations[protocol]["mean_final"] for run in ours.get(method, [])]
             cells += across_seeds(finals)[::2]
         rows.append((method, _plus_minus(scores.get(method)), *cells))
-    columns = [f"ours, {each}{part}" for each in protocols for part in ("", ": 95% interval")]
+    columns = [f"ours, {protocol}{part}" for protocol in protocols for part in ("", ": 95% interval")]
     return Table(name, ("method", "paper, Table 2", *columns), tuple(rows))
 
 
 def cost_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
-    """Time and memory per method, beside the paper's Tables 6 and 7; None where no run was timed."""
-    if all(each.training_seconds is None for each in results):
+    """Time and memory per method, with those of the paper's Tables 6 and 7; None if no run was timed."""
+    if all(result.training_seconds is None for result in results):
         return None
     costs = published()["costs"].get(environment, {})
     rows: list[tuple[Cell, ...]] = []
@@ -96,7 +96,7 @@ def cost_table(name: str, environment: str, results: Sequence[RunResult]) -> Tab
 
 
 def context_table(name: str, ratios: Sequence[tuple[str, Sequence[float | None]]]) -> Table:
-    """How far contexts of one task lie apart, as a share of how far those of two tasks do."""
+    """Mean distance of contexts of one task over that of contexts of two tasks, by method."""
     rows = tuple((method, len(values), *across_seeds(values)[::2]) for method, values in ratios)
     return Table(name, ("method", "seeds", "within / between tasks", "95% interval"), rows)
 
@@ -104,26 +104,26 @@ def context_table(name: str, ratios: Sequence[tuple[str, Sequence[float | None]]
 def attention_table(
     name: str, environment: str, weights: Sequence[tuple[str, Sequence[TransitionWeights]]]
 ) -> Table | None:
-    """Relative weights of transitions with and without reward, beside the paper's Table 5.
+    """Relative weights of transitions with and without reward, with those of the paper's Table 5.
 
-    None where no trajectory holds both kinds.
+    None if no trajectory contains both kinds.
     """
     printed = published()["attention"].get(environment, {})
     rows: list[tuple[Cell, ...]] = []
     for kind in ("nonzero", "zero"):
         for method, runs in weights:
-            found = [getattr(each, kind) for each in runs]
-            if any(len(each) == 0 for each in found):
+            found = [getattr(run_weights, kind) for run_weights in runs]
+            if any(len(values) == 0 for values in found):
                 continue
-            mean, _, interval = across_seeds([float(each.mean()) for each in found])
-            median = across_seeds([float(np.median(each)) for each in found])[0]
+            mean, _, interval = across_seeds([float(values.mean()) for values in found])
+            median = across_seeds([float(np.median(values)) for values in found])[0]
             rows.append((method, f"{kind} reward", mean, interval, median, *printed.get(kind, ())))
     columns = ("method", "transitions", "mean", "95% interval", "median")
     return Table(name, (*columns, *(PAPER_ATTENTION if printed else ())), tuple(rows)) if rows else None
 
 
 def dataset_table(name: str, dataset: Dataset) -> Table:
-    """Mean returns of the stored episodes by snapshot, over tasks (the paper's Table 8 is lost to us)."""
+    """Mean returns of the stored episodes over tasks, by snapshot (the paper's Table 8 is unknown to us)."""
     tasks = return_table(dataset)["tasks"]
     steps = sorted({found["step"] for task in tasks for found in task["snapshots"]})
     rows: list[tuple[Cell, ...]] = []
@@ -134,28 +134,30 @@ def dataset_table(name: str, dataset: Dataset) -> Table:
 
 
 def setup_table(name: str, results: Sequence[RunResult]) -> Table:
-    """What the runs are a function of."""
+    """Inputs and settings that determine the results of the runs."""
     values: dict[str, list[Any]] = {
-        "dataset root": [each.root for each in results],
-        "training profile": [each.profile for each in results],
-        "seeds": [each.seed for each in results],
-        "training steps": [each.steps for each in results],
-        "device": [each.device for each in results],
-        "threads per run": [each.threads for each in results],
-        "versions": [", ".join(f"{key} {value}" for key, value in each.versions.items()) for each in results],
+        "dataset root": [result.root for result in results],
+        "training profile": [result.profile for result in results],
+        "seeds": [result.seed for result in results],
+        "training steps": [result.steps for result in results],
+        "device": [result.device for result in results],
+        "threads per run": [result.threads for result in results],
+        "versions": [
+            ", ".join(f"{key} {value}" for key, value in result.versions.items()) for result in results
+        ],
     }
     rows = tuple((key, ", ".join(dict.fromkeys(map(str, found)))) for key, found in values.items())
-    return Table(name, ("what", "value"), rows)
+    return Table(name, ("property", "value"), rows)
 
 
 def digest_table(name: str, results: Sequence[RunResult]) -> Table:
-    """Digest of every run's tensors, by which a repetition compares."""
-    rows = tuple((each.method, each.seed, each.digest) for each in results)
+    """Digests of the runs' tensors, for comparison with a repetition."""
+    rows = tuple((result.label, result.seed, result.digest) for result in results)
     return Table(name, ("method", "seed", "sha256 of all tensors"), rows)
 
 
 def published() -> dict[str, Any]:
-    """The paper's numbers that ours stand beside."""
+    """Numbers of the paper that reports print beside ours."""
     file = importlib.resources.files("tcmrl_manifests") / "published.toml"
     return tomllib.loads(file.read_text(encoding="utf-8"))
 
@@ -172,4 +174,4 @@ def _mean_return(tasks: Sequence[dict[str, Any]], split: str, step: int | None) 
 
 
 def _plus_minus(score: Sequence[float] | None) -> str | None:
-    return None if score is None else " ± ".join(f"{each:g}" for each in score)
+    return None if score is None else " ± ".join(f"{number:g}" for number in score)

@@ -1,4 +1,4 @@
-"""What a report is on: results folders as experiments left them, and single runs gathered into one."""
+"""Inputs of a report: results folders of experiments, and single runs."""
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
@@ -15,11 +15,11 @@ from tcmrl_data import CheckpointError, TrainingError, canonical_json, open_data
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A result, and the folder of the run that it came from, which may be gone.
+    """A result, and the folder of its run, which may be removed.
 
     Attributes:
-        result: the document.
-        folder: the run's, with its checkpoints.
+        result: the result of the run.
+        folder: folder of the run, with its checkpoints.
     """
 
     result: RunResult
@@ -28,12 +28,12 @@ class FinishedRun:
 
 @dataclass(frozen=True)
 class Source:
-    """One experiment and its finished runs, by environment, method and seed.
+    """An experiment and its finished runs, ordered by environment, method and seed.
 
     Attributes:
-        experiment: the file.
-        runs: finished.
-        missing: the file's other runs, and why they failed where they did.
+        experiment: the experiment.
+        runs: its finished runs.
+        missing: its other runs, with the error of those that failed.
     """
 
     experiment: Experiment
@@ -41,26 +41,26 @@ class Source:
     missing: tuple[str, ...] = ()
 
     def environments(self) -> list[str]:
-        """Those with finished runs."""
-        return list(dict.fromkeys(each.result.environment for each in self.runs))
+        """Environments with finished runs."""
+        return list(dict.fromkeys(run.result.environment for run in self.runs))
 
     def of(self, environment: str) -> list[FinishedRun]:
-        """Its finished runs."""
-        return [each for each in self.runs if each.result.environment == environment]
+        """Finished runs in an environment."""
+        return [run for run in self.runs if run.result.environment == environment]
 
 
 def read_sources(
     paths: Sequence[Path], report: Callable[[str, int, int], None], *, datasets: Sequence[Path] = ()
 ) -> list[Source]:
-    """Results folders in the order given, then one source of all run folders, which are evaluated here.
+    """Reads results folders in the given order; then all run folders as one source, evaluating the runs.
 
     Args:
         paths: the folders.
-        report: called as run folders are evaluated.
-        datasets: folders of datasets that have moved since the runs were trained on them.
+        report: called when run folders are evaluated.
+        datasets: folders of datasets that were moved after the training of the runs.
 
     Raises:
-        CheckpointError: neither kind of folder, no finished run in it, or a dataset of none of the runs.
+        CheckpointError: not a results or run folder, no finished run in it, or a dataset of no run.
     """
     places = {open_dataset(folder).manifest.root: str(folder.resolve()) for folder in datasets}
     sources, runs = [], []
@@ -71,8 +71,8 @@ def read_sources(
             runs.append(open_run(path))
         else:
             raise CheckpointError(
-                f"{path} has neither experiment.json nor run.json; name a folder that `tcmrl experiment` or "
-                "`tcmrl train` made"
+                f"{path} contains neither experiment.json nor run.json; name a folder of "
+                "`tcmrl experiment` or `tcmrl train`"
             )
     if runs:
         sources.append(_single_runs(runs, report, places))
@@ -80,13 +80,13 @@ def read_sources(
     for root, place in places.items():
         if root not in used:
             raise CheckpointError(
-                f"--dataset {place} has root {root[:12]}, which no run was trained on; leave it out"
+                f"--dataset {place} has root {root[:12]}, on which no run was trained; omit it"
             )
     return sources
 
 
-def _at_home(result: RunResult, places: Mapping[str, str]) -> RunResult:
-    """A result that says where its dataset lies now."""
+def _relocated(result: RunResult, places: Mapping[str, str]) -> RunResult:
+    """A result with the present folder of its dataset."""
     return result.model_copy(update={"dataset": places.get(result.root, result.dataset)})
 
 
@@ -95,18 +95,18 @@ def _results_folder(path: Path, places: Mapping[str, str]) -> Source:
     try:
         tables = parse_json(file.read_bytes())
     except ValueError as error:
-        raise CheckpointError(f"{file}: {error}; run `tcmrl experiment` again, which writes it") from None
+        raise CheckpointError(f"{file}: {error}; run `tcmrl experiment` again to rewrite the file") from None
     if not isinstance(tables, dict):
-        raise TrainingError(f"{file} is no experiment; run `tcmrl experiment` again, which writes it")
+        raise TrainingError(f"{file} is not an experiment; run `tcmrl experiment` again to rewrite the file")
     experiment = read_experiment(tables, place=str(file))
     found = [
         FinishedRun(
-            _at_home(result, places), path / "runs" / run_id(result.environment, result.method, result.seed)
+            _relocated(result, places), path / "runs" / run_id(result.environment, result.method, result.seed)
         )
         for result in read_results(path, experiment)
     ]
     if not found:
-        raise CheckpointError(f"{path} holds no finished run yet; `tcmrl experiment` goes on with them")
+        raise CheckpointError(f"{path} contains no finished run; continue with `tcmrl experiment`")
     return Source(experiment, tuple(found), _missing(path, experiment))
 
 
@@ -126,7 +126,7 @@ def _missing(path: Path, experiment: Experiment) -> tuple[str, ...]:
 def _single_runs(
     runs: Sequence[Run], report: Callable[[str, int, int], None], places: Mapping[str, str]
 ) -> Source:
-    """Runs as if an experiment had made them; those of one algorithm count as seeds of one method."""
+    """Single runs as an experiment; runs of one algorithm are the seeds of one method."""
     labels = labels_of(runs)
     experiment = read_experiment(
         {
@@ -149,14 +149,15 @@ def _single_runs(
         found.append(FinishedRun(_evaluated(label, run, places.get(run.record.root)), run.folder))
     report("evaluating", len(runs), len(runs))
     order = list(experiment.methods)
-    key = [(each.result.environment, order.index(each.result.method), each.result.seed) for each in found]
-    return Source(
-        experiment, tuple(each for _, each in sorted(zip(key, found, strict=True), key=lambda x: x[0]))
-    )
+
+    def place_of(run: FinishedRun) -> tuple[str, int, int]:
+        return run.result.environment, order.index(run.result.method), run.result.seed
+
+    return Source(experiment, tuple(sorted(found, key=place_of)))
 
 
 def labels_of(runs: Sequence[Run]) -> list[str]:
-    """The algorithm where seeds alone tell its runs on an environment apart, else the folder's name too."""
+    """Labels of runs: the algorithm, and the folder's name if its runs differ by more than the seed."""
     groups: dict[tuple[str, str], list[Run]] = {}
     names = [run.record.config.settings.run.algorithm for run in runs]
     for name, run in zip(names, runs, strict=True):
@@ -168,7 +169,7 @@ def labels_of(runs: Sequence[Run]) -> list[str]:
 
 
 def _are_seeds(runs: Sequence[Run]) -> bool:
-    """Whether runs have all in common but their seeds."""
+    """Whether the runs differ only by their seeds."""
     kinds = {
         (canonical_json(run.record.config.model_dump(mode="json")), run.record.root, run.newest().step)
         for run in runs

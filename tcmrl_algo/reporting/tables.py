@@ -1,4 +1,4 @@
-"""Tables of a report: once as Markdown, once as CSV."""
+"""Tables of a report, as Markdown and as CSV."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,12 +11,12 @@ Cell = str | float | int | None
 
 @dataclass(frozen=True)
 class Table:
-    """A named table; None stands for a value that does not exist.
+    """A named table; None is a missing value.
 
     Attributes:
-        name: of its CSV file.
+        name: name of the CSV file.
         columns: headings.
-        rows: cells, as many as columns.
+        rows: cells of the rows, one per column.
     """
 
     name: str
@@ -24,18 +24,18 @@ class Table:
     rows: tuple[tuple[Cell, ...], ...]
 
     def markdown(self) -> str:
-        """The table for reading, numbers with four significant digits."""
+        """The table as Markdown, with four significant digits."""
         lines = [self.columns, ("---",) * len(self.columns), *self.rows]
-        return "\n".join(f"| {' | '.join(_text(each) for each in line)} |" for line in lines)
+        return "\n".join(f"| {' | '.join(_text(cell) for cell in line)} |" for line in lines)
 
     def csv(self) -> str:
-        """The table for programs, numbers in full."""
+        """The table as CSV, with all digits."""
         return table_text([dict(zip(self.columns, row, strict=True)) for row in self.rows], self.columns)
 
 
 def across_seeds(values: Sequence[float | None]) -> tuple[Cell, Cell, Cell]:
-    """Mean, interquartile mean, and the interval as words; the seeds themselves where they are too few."""
-    known = [each for each in values if each is not None]
+    """Mean, interquartile mean, and interval as text, or the values of all seeds if they are too few."""
+    known = [value for value in values if value is not None]
     if not known or len(known) < len(values):
         return None, None, None
     summary = summarize(known)
@@ -43,9 +43,9 @@ def across_seeds(values: Sequence[float | None]) -> tuple[Cell, Cell, Cell]:
 
 
 def interval_text(values: Sequence[float], low: float | None, high: float | None) -> str:
-    """The 95% interval, or the seeds."""
+    """The 95% interval as text, or the values of all seeds if there is none."""
     if low is None or high is None:
-        return "seeds: " + ", ".join(f"{each:.4g}" for each in values)
+        return "seeds: " + ", ".join(f"{value:.4g}" for value in values)
     return f"{low:.4g} to {high:.4g}"
 
 

@@ -1,4 +1,4 @@
-"""Writes a report: Markdown, with every table as CSV and every figure as PNG beside it."""
+"""Writes a report as Markdown, with a CSV file per table and a PNG file per figure."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -20,40 +20,42 @@ from tcmrl_data.foundation.disk import replace_file
 ReportProgress = Callable[[str, int, int], None]
 
 NOTE = """\
-Returns are undiscounted sums of rewards after adaptation to the test tasks, means over them. An interval is \
-the 95% bootstrap interval of the mean across seeds; fewer than five seeds are printed themselves. All seeds \
-share a dataset, its split and its test tasks: intervals tell of training alone, and of five seeds they hold \
-the true mean in some 84% of cases. \
-`other context` is the same policy under other tasks' contexts; regret is what is missing to the oracle; a \
-normalized score of 0 is uniform actions, 1 the oracle or, without one, the best behavior policy."""
+Returns are undiscounted sums of rewards after adaptation, averaged over the test tasks. Intervals are 95% \
+bootstrap intervals of the mean across seeds; with fewer than five seeds, the values of all seeds are \
+printed. All seeds share the dataset, its split and its test tasks, so intervals show only the variance of \
+training; intervals of five seeds contain the true mean in about 84% of cases. `other context` is the \
+return of the same policy with the contexts of other tasks; the regret is the oracle's return minus the \
+policy's; the normalized score is 0 for uniform actions and 1 for the oracle or, without one, for the best \
+behavior policy. A `(privileged)` method is a control that observes the task parameters."""
 CLAIMS = """\
-Differences seed by seed, turned so that positive speaks for the claim: supported where the 95% interval of \
-their mean, by Student's t, lies above 0, contradicted where below. Under five seeds there is no interval \
-and no verdict. Each claim is judged alone, without a correction for their number."""
+Differences are taken seed by seed, and positive differences support the claim. A claim is supported if \
+the 95% interval of the mean difference (Student's t) is above 0, and contradicted if it is below 0. With \
+fewer than five seeds there is no interval and no verdict. Verdicts are not corrected for the number of \
+claims."""
 BESIDE = """\
-The paper's data, split of tasks and training differ from these, and its score is of its own protocol: the \
-columns share a unit, no more."""
+The paper has other data, another split of tasks, other training and its own protocol: the columns have \
+the same unit, but are not comparable otherwise."""
 COSTS = """\
-Training alone; evaluation is all points of the learning curve and all protocols. Memory is the process's, \
-or on CUDA that of tensors on the device. Runs that shared a machine were slower for it. The paper's, where \
-they stand beside ours, are of 40,000 steps on one RTX 2080 Ti."""
+Training time excludes evaluation; evaluation time covers all points of the learning curve and all \
+protocols. Memory is that of the process or, on CUDA, of the tensors on the device. Runs that shared a \
+machine are slower. The paper's numbers, if printed, are for 40,000 steps on one RTX 2080 Ti."""
 CONTEXTS = """\
-Each point is the context of one stored trajectory, by t-SNE, of each method's first seed; triangles are \
-test tasks. The table holds the mean distance between contexts of one task over that between contexts of \
-two, in the latent space itself."""
+Every point is the t-SNE of the context of one stored trajectory, for the first seed of every method; \
+triangles are test tasks. The table contains the mean distance between contexts of one task over that \
+between contexts of two tasks, in the latent space."""
 ATTENTION = """\
-Trajectories with both kinds of transitions only. The paper's weights are not relative: compare the ratio of \
-the rows."""
+Only trajectories with both kinds of transitions count. The paper's weights are not relative: compare the \
+ratios of the rows."""
 
 
 @dataclass(frozen=True)
 class WrittenReport:
-    """What was written.
+    """Files and verdicts of a report.
 
     Attributes:
         report: the Markdown file.
-        files: everything, `report` included.
-        verdicts: on the experiments' claims.
+        files: all files, including `report`.
+        verdicts: verdicts on the claims of the experiments.
     """
 
     report: Path
@@ -64,7 +66,7 @@ class WrittenReport:
 @final
 @dataclass
 class Page:
-    """The text as it grows, and the files beside it."""
+    """The text of the report so far, and the files of its tables and figures."""
 
     out: Path
     lines: list[str] = field(default_factory=list)
@@ -81,19 +83,19 @@ class Page:
         self.data(table)
 
     def data(self, table: Table) -> None:
-        """Adds the CSV file of a table that is too long to read."""
+        """Adds only the CSV file of a table."""
         self.files.append(self.out / f"{table.name}.csv")
         replace_file(self.files[-1], table.csv().encode())
 
     def figure(self, name: str, caption: str) -> Path:
-        """Adds a figure; the file is the caller's to draw."""
+        """Adds a figure, and returns the file that the caller must draw."""
         self.files.append(self.out / f"{name}.png")
         self.text(f"![{caption}]({name}.png)")
         return self.files[-1]
 
 
 def ignore(stage: str, done: int, total: int) -> None:
-    """Reports nothing."""
+    """Ignores progress."""
 
 
 def write_report(
@@ -103,16 +105,16 @@ def write_report(
     datasets: Sequence[str | Path] = (),
     report: ReportProgress = ignore,
 ) -> WrittenReport:
-    """Writes a report on results folders of experiments, and on run folders.
+    """Writes a report on results folders of experiments and on run folders.
 
     Args:
-        paths: the folders; all run folders together make one section.
-        out: folder of the report, made here; files of an earlier report are replaced.
-        datasets: folders of datasets that have moved since the runs were trained on them.
-        report: called with a stage, and how much of it is done and to do.
+        paths: the folders; all run folders are in one section.
+        out: folder of the report, created if needed; files of an earlier report are replaced.
+        datasets: folders of datasets that were moved after the training of the runs.
+        report: called with the name of a stage, the amount done and the total amount.
 
     Raises:
-        CheckpointError: a folder is of neither kind or holds nothing finished, or a dataset is of no run.
+        CheckpointError: not a results or run folder, no finished run in it, or a dataset of no run.
 
     Example:
         >>> write_report(["results/figure5"], "docs/results/figure5").verdicts  # doctest: +SKIP
@@ -127,7 +129,7 @@ def write_report(
     judged: dict[str, list[Verdict]] = {}
     for number, source in enumerate(sources):
         name = source.experiment.name
-        if any(each.experiment.name == name for each in sources[:number]):
+        if any(earlier.experiment.name == name for earlier in sources[:number]):
             name = f"{name}-{number}"
         judged[name] = _write_source(page, source, name, trained, report, alone=len(sources) == 1)
     verdicts = tuple(itertools.chain.from_iterable(judged.values()))
@@ -147,7 +149,7 @@ def _write_source(
     page.text(f"## {experiment.title}")
     page.text(f"Experiment `{experiment.name}` (source: {experiment.source}).")
     if source.missing:
-        page.text(f"Not among its results: {len(source.missing)} of its runs, {', '.join(source.missing)}.")
+        page.text(f"Results are missing for {len(source.missing)} of its runs, {', '.join(source.missing)}.")
     verdicts = _verdicts(source, trained)
     if verdicts:
         page.text("### Claims")
@@ -168,7 +170,7 @@ def _verdicts(source: Source, trained: Trained) -> list[Verdict]:
             return measure_result(run.result, metric, protocol)
         try:
             weights = trained.contexts(run).weights
-        except TcmrlError:  # said where the section on attention is left out
+        except TcmrlError:  # the section on contexts prints the error
             return None
         found = getattr(weights, metric.removeprefix("attention_"), np.empty(0))
         return float(found.mean()) if len(found) else None
@@ -184,19 +186,19 @@ def _verdicts(source: Source, trained: Trained) -> list[Verdict]:
 def _write_environment(
     page: Page, name: str, environment: str, runs: Sequence[FinishedRun], trained: Trained
 ) -> None:
-    results = [each.result for each in runs]
+    results = [run.result for run in runs]
     page.text(f"### {environment}")
     page.table(sections.setup_table(f"{name}-setup", results))
     page.table(sections.final_table(f"{name}-returns", results))
     figures.draw_finals(page.figure(f"{name}-returns", "final returns"), environment, results)
-    if any(len(each.curve) > 1 for each in results):
+    if any(len(result.curve) > 1 for result in results):
         page.text("#### Learning curves")
         protocol = next(iter(results[0].evaluations))
         figures.draw_curves(page.figure(f"{name}-curves", "learning curves"), environment, results, protocol)
         page.data(sections.curve_table(f"{name}-curves", results))
     published = sections.published_table(f"{name}-paper", environment, results)
     if published is not None:
-        page.text("#### Beside the paper")
+        page.text("#### Numbers of the paper")
         page.text(BESIDE)
         page.table(published)
     costs = sections.cost_table(f"{name}-costs", environment, results)
@@ -207,9 +209,9 @@ def _write_environment(
     try:
         _write_contexts(page, name, environment, runs, trained)
     except TcmrlError as error:
-        page.text(f"Contexts, attention and the dataset's returns are left out: {error}.")
+        page.text(f"Contexts, attention and the dataset's returns are omitted: {error}.")
     page.data(sections.digest_table(f"{name}-digests", results))
-    page.text(f"Digests of the runs' tensors are in [{name}-digests.csv]({name}-digests.csv).")
+    page.text(f"[Digests of the runs' tensors]({name}-digests.csv).")
 
 
 def _write_contexts(
@@ -218,18 +220,22 @@ def _write_contexts(
     stored = trained.stored(runs[0])
     found: dict[str, list[TrainedContexts]] = {}
     for run in runs:
-        found.setdefault(run.result.method, []).append(trained.contexts(run))
+        found.setdefault(run.result.label, []).append(trained.contexts(run))
     page.text("#### Contexts")
-    page.text(f"Of {len(stored.tasks)} tasks. {CONTEXTS}")
-    first = {method: each[0].contexts for method, each in found.items()}
-    points = {method: embed(each) for method, each in first.items() if each is not None}
+    page.text(f"{len(stored.tasks)} tasks. {CONTEXTS}")
+    first = {method: trained_runs[0].contexts for method, trained_runs in found.items()}
+    points = {method: embed(contexts) for method, contexts in first.items() if contexts is not None}
     if points:
-        labels = {method: each[0].labels for method, each in found.items()}
+        labels = {method: trained_runs[0].labels for method, trained_runs in found.items()}
         is_test = [task.split == "test" for task in stored.tasks]
         figures.draw_embeddings(page.figure(f"{name}-tsne", "t-SNE of contexts"), points, labels, is_test)
-    ratios = [(method, [each.distance_ratio() for each in all_]) for method, all_ in found.items()]
+    ratios = [
+        (method, [contexts.distance_ratio() for contexts in trained_runs])
+        for method, trained_runs in found.items()
+    ]
     page.table(sections.context_table(f"{name}-contexts", ratios))
-    _write_attention(page, name, environment, {method: _weights(each) for method, each in found.items()})
+    weights = {method: _weights(trained_runs) for method, trained_runs in found.items()}
+    _write_attention(page, name, environment, weights)
     if runs[0].result.root not in page.datasets:
         page.datasets.add(runs[0].result.root)
         page.text("#### Returns of the dataset")
@@ -237,22 +243,22 @@ def _write_contexts(
 
 
 def _weights(contexts: Sequence[TrainedContexts]) -> list[TransitionWeights]:
-    return [each.weights for each in contexts if each.weights is not None]
+    return [trained_run.weights for trained_run in contexts if trained_run.weights is not None]
 
 
 def _write_attention(
     page: Page, name: str, environment: str, weights: dict[str, list[TransitionWeights]]
 ) -> None:
-    with_attention = {method: each for method, each in weights.items() if each}
+    with_attention = {method: run_weights for method, run_weights in weights.items() if run_weights}
     if not with_attention:
         return
     page.text("#### Attention")
-    page.text("A transition's weight in the context of its trajectory, times the steps: even attention is 1.")
-    first = {method: each[0] for method, each in with_attention.items()}
+    page.text("Weight of a transition in its trajectory's context, times the steps; uniform attention is 1.")
+    first = {method: run_weights[0] for method, run_weights in with_attention.items()}
     figures.draw_attention(page.figure(f"{name}-attention", "attention along trajectories"), first)
     table = sections.attention_table(f"{name}-attention", environment, list(with_attention.items()))
     if table is None:
-        page.text("No stored trajectory holds transitions both with and without reward.")
+        page.text("No stored trajectory contains transitions both with and without reward.")
     else:
         page.text(ATTENTION)
         page.table(table)
