@@ -22,7 +22,7 @@ from .frame import (
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tcmrl_algo import ExperimentReport, FinishedRun, RunResult
+    from tcmrl_algo import EndedRun, ExperimentReport, RunResult
 
 NUM_SEEDS = 10_000
 
@@ -146,7 +146,7 @@ def _print_list(*, as_json: bool) -> None:
     print_table(table)
 
 
-def _line(event: "FinishedRun") -> str:
+def _line(event: "EndedRun") -> str:
     left = f", about {duration(event.seconds_left)} left" if event.seconds_left else ""
     if event.result is None:
         return f"{event.done} of {event.total}: {event.id} failed: {event.error}{left}"

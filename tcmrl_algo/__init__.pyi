@@ -15,8 +15,8 @@ from .experiment.config import experiment_names as experiment_names
 from .experiment.config import load_experiment as load_experiment
 from .experiment.results import RunResult as RunResult
 from .experiment.results import by_method as by_method
+from .experiment.runner import EndedRun as EndedRun
 from .experiment.runner import ExperimentReport as ExperimentReport
-from .experiment.runner import FinishedRun as FinishedRun
 from .experiment.runner import run_experiment as run_experiment
 from .methods.base import METHODS as METHODS
 from .methods.base import Algorithm as Algorithm

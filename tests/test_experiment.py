@@ -21,7 +21,7 @@ from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.job import Job, run_job
 from tcmrl_algo.experiment.planning import plan_runs, resolve_method
 from tcmrl_algo.experiment.results import RunResult, read_results
-from tcmrl_algo.experiment.runner import FinishedRun
+from tcmrl_algo.experiment.runner import EndedRun
 from tcmrl_data import SelectionError, TcmrlError, TrainingError
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
@@ -44,7 +44,7 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
 def finished(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
     """The results folder of the small experiment, run once."""
     out = tmp_path_factory.mktemp("results") / "small"
-    events: list[FinishedRun] = []
+    events: list[EndedRun] = []
     report = run_experiment(_small(tiny_folder), out, workers=2, report=events.append)
     assert (report.present, report.failed, len(report.results)) == (0, (), 4)
     assert [(each.done, each.total) for each in events] == [(done, 4) for done in (1, 2, 3, 4)]

@@ -22,7 +22,7 @@ WORKER = "tcmrl_algo.experiment.job"
 
 
 @dataclass(frozen=True)
-class FinishedRun:
+class EndedRun:
     """A run that ended in this call.
 
     Attributes:
@@ -60,7 +60,7 @@ class ExperimentReport:
     seconds: float
 
 
-def ignore(event: FinishedRun) -> None:
+def ignore(event: EndedRun) -> None:
     """Reports nothing."""
 
 
@@ -74,7 +74,7 @@ def run_experiment(
     steps: int | None = None,
     workers: int | None = None,
     device: str = "cpu",
-    report: Callable[[FinishedRun], None] = ignore,
+    report: Callable[[EndedRun], None] = ignore,
 ) -> ExperimentReport:
     """Runs an experiment, without the runs that are finished; checks all of it before the first run starts.
 
@@ -132,7 +132,7 @@ def run_experiment(
             pace = (time.perf_counter() - began) / (ended - present)
             is_known = ended - present >= min(workers, len(jobs))
             left = pace * (len(plan) - ended) if is_known else None
-            report(FinishedRun(name, result, error, ended, len(plan), left))
+            report(EndedRun(name, result, error, ended, len(plan), left))
     results = tuple(result for result in found.values() if result is not None)
     return ExperimentReport(out, results, present, tuple(failed), time.perf_counter() - began)
 
