@@ -187,7 +187,7 @@ def seal_part(
 
 
 def roll_out_part(plan: BuildPlan, *, task: Task, snapshot: Snapshot, lanes: Lanes) -> list[Trajectory]:
-    """The recipe's episodes of one snapshot, in lane batches; each episode has its own keyed seeds."""
+    """The recipe's episodes of one snapshot, in lane batches; every episode has its own keyed seeds."""
     environment = plan.environment
     controller = snapshot.controller(environment, [task.parameters] * lanes.num_lanes)
     key = (plan.seed, environment.name, task.index)

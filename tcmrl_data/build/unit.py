@@ -1,4 +1,4 @@
-"""What one worker does: train a unit's behavior policies, roll them out, publish each part. Idempotent."""
+"""What one worker does: train a unit's behavior policies, roll them out, publish the parts. Idempotent."""
 
 import contextlib
 import math

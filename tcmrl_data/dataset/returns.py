@@ -106,9 +106,9 @@ def episode_table(dataset: Dataset, *, task: int | None = None, step: int | None
     """
     tasks = dataset.tasks if task is None else (dataset.task(task),)
     parts = [
-        (each.index, found)
-        for each in tasks
-        for found in dataset.snapshots(each.index)
+        (task.index, found)
+        for task in tasks
+        for found in dataset.snapshots(task.index)
         if step is None or found == step
     ]
     if not parts:
@@ -136,14 +136,14 @@ def summarize_returns(table: dict[str, Any]) -> list[dict[str, Any]]:
             found = list(_at(table, step, split))
             if not found:
                 continue
-            means = np.array([each["mean"] for each in found])
-            success = [each["success_rate"] for each in found if each["success_rate"] is not None]
+            means = np.array([row["mean"] for row in found])
+            success = [row["success_rate"] for row in found if row["success_rate"] is not None]
             rows.append(
                 {
                     "step": step,
                     "split": split,
                     "tasks": len(found),
-                    "episodes": sum(each["episodes"] for each in found),
+                    "episodes": sum(row["episodes"] for row in found),
                     "mean": float(means.mean()),
                     "std": float(means.std()),
                     "min": float(means.min()),
@@ -214,7 +214,7 @@ def _draw_split(axes: "Axes", table: dict[str, Any], split: str, color: str) -> 
 def _draw_references(axes: "Axes", dataset: Dataset) -> None:
     references = list(dataset.manifest.references.values())
     for name, line in (("oracle", "--"), ("uniform", ":")):
-        values = [value for each in references if (value := getattr(each, name)) is not None]
+        values = [value for record in references if (value := getattr(record, name)) is not None]
         if values:
             axes.axhline(
                 float(np.mean(values)), color="0.3", linestyle=line, label=f"{name}, mean of all tasks"
@@ -230,8 +230,8 @@ def _returns(dataset: Dataset, task: int, step: int, recompute: bool) -> dict[st
         statistics = dataset.part(task, step).statistics
         return {field: getattr(statistics, field) for field in RETURN_FIELDS}
     trajectories = dataset.trajectories(task, step)
-    returns = np.array([each.undiscounted_return for each in trajectories])
-    success = [each for each in map(_success, trajectories) if each is not None]
+    returns = np.array([trajectory.undiscounted_return for trajectory in trajectories])
+    success = [flag for flag in map(_success, trajectories) if flag is not None]
     return {
         "episodes": len(trajectories),
         "steps": sum(map(len, trajectories)),

@@ -11,12 +11,12 @@ from tcmrl_data.recipe.recipe import Recipe, TaskChoice
 
 
 def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]:
-    """Indices of `num_train` training and `num_test` test tasks, each evenly spaced within its split.
+    """Indices of `num_train` training and `num_test` test tasks, evenly spaced within their split.
 
-    The first and the last task of each split are taken, so that a smaller selection spans the same range.
+    The first and the last task of a split are taken, so that a smaller selection spans the same range.
 
     Raises:
-        TaskError: a split has fewer tasks than asked for.
+        TaskError: a split has fewer tasks than that.
     """
     chosen: list[int] = []
     for split, number in (("train", num_train), ("test", num_test)):
@@ -54,7 +54,7 @@ def pick_tasks(tasks: Sequence[Task], choice: TaskChoice, indices: Sequence[int]
 def group_tasks(tasks: Iterable[Task], group_size: int) -> list[tuple[Task, ...]]:
     """The tasks, ascending, put together where index // group_size is equal.
 
-    A group thus depends on the recipe and on which tasks are asked for, never on the machine.
+    A group thus depends on the recipe and on which tasks are built, never on the machine.
     """
     ordered = sorted(tasks, key=lambda task: task.index)
     return [tuple(group) for _, group in groupby(ordered, key=lambda task: task.index // group_size)]

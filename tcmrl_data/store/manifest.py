@@ -120,7 +120,7 @@ class Statistics(Record):
 
 
 class References(Record):
-    """Mean returns that results are held against, each over the recipe's number of episodes.
+    """Mean returns to compare results with, over the recipe's number of episodes.
 
     Attributes:
         uniform: uniform actions.
@@ -204,7 +204,7 @@ class Manifest(Record):
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> "Manifest":
-        indices, keys = [task.index for task in self.tasks], [(each.task, each.step) for each in self.parts]
+        indices, keys = [task.index for task in self.tasks], [(part.task, part.step) for part in self.parts]
         if indices != sorted(set(indices)) or list(self.steps) != sorted(set(self.steps)):
             raise ValueError("tasks and steps must be sorted, each once")
         if keys != sorted(set(keys)):
