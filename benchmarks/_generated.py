@@ -1,4 +1,4 @@
-"""Datasets of random numbers in any size, published as real ones are; for benchmarks only."""
+"""Writes datasets of random numbers in any size with the code that publishes real ones, for benchmarks."""
 
 from pathlib import Path
 
@@ -25,16 +25,16 @@ def generate_dataset(
 ) -> int:
     """Writes a dataset of training tasks whose episodes are white noise of the full horizon.
 
-    Every file is made, digested and published by the code that builds datasets; only the simulation and
-    the policy training are left out. Noise compresses worse than physics does.
+    The code that builds datasets creates, hashes and publishes every file; only simulation and policy
+    training are omitted. Noise compresses worse than the data of a simulator.
 
     Args:
-        folder: where; a dataset of the same arguments is taken as it is.
+        folder: folder of the dataset; a dataset of the same arguments is kept.
         environment_name: gives observation and action size and the horizon.
-        tasks: training tasks, the first of the task set.
-        snapshots: parts per task.
-        episodes: per part.
-        seed: of the noise.
+        tasks: number of training tasks, the first of the task set.
+        snapshots: number of parts per task.
+        episodes: number of episodes per part.
+        seed: seed of the noise.
 
     Returns:
         The number of transitions.

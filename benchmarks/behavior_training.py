@@ -2,11 +2,10 @@
 
     python benchmarks/behavior_training.py [--quick] [--seconds 10]
 
-A task-step is one environment step of one task and its update, in the real environment; the warm-up is
-passed before the clock starts. Both sides run with one thread, in this process, in float32 but
-for the rows of precision `medium`; seconds are CPU
-seconds of the process, so that other load on the machine counts little. Each `sac` row stands beside the
-`stacked` rows of the same setting.
+A task-step is one environment step of one task with its update, in the real environment. The measurement
+starts after the warm-up. Both sources run in this process with one thread, in float32 except for the rows
+of precision `medium`. Seconds are CPU seconds of the process, so other load on the machine has little
+effect. Every `sac` row is followed by the `stacked` rows of the same setting.
 """
 
 import argparse

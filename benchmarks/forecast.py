@@ -1,8 +1,8 @@
-"""Forecasts of builds beside the builds themselves: `python benchmarks/forecast.py [RECIPE PROFILE ...]`.
+"""Compares forecasts of builds with the builds: `python benchmarks/forecast.py [RECIPE PROFILE ...]`.
 
-Prints JSON: per build the forecast with its spread, the seconds that the build then took, and their ratio. A
-forecast holds within a factor of 1.6 on a machine that is equally busy throughout; exit code 1 where one does
-not. `--tasks` and `--set` shorten builds that take hours.
+Prints JSON: the forecast of every build with its spread, the duration of the build in seconds, and their
+ratio. A forecast is correct within a factor of 1.6 on a machine of constant load; the exit code is 1 if one
+is not. `--tasks` and `--set` shorten builds that take hours.
 """
 
 import argparse

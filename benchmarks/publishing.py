@@ -1,4 +1,4 @@
-"""What fsync and hashing cost: their share of the time that a unit takes. Prints JSON.
+"""Measures the shares of fsync and of hashing in the time of a unit of work. Prints JSON.
 
 `python benchmarks/publishing.py [ENV]`; one task of the quick profile, in this process.
 """

@@ -1,4 +1,4 @@
-"""How fast batches come, beside other libraries doing the same work. Prints JSON, a line per size.
+"""Measures the rate of batches against other libraries with the same work. Prints JSON, a line per size.
 
 `python benchmarks/sampling.py [--quick] [--repeats N] [--size NAME] [--folder FOLDER]`
 

@@ -1,4 +1,4 @@
-"""What one training step costs, part by part, against the machine's matmul peak. Prints JSON.
+"""Measures the time of a training step and its parts against the peak of matrix products. Prints JSON.
 
 `python benchmarks/training_step.py [--threads N] [--algorithm NAME] [--precision NAME] [--repeats N]`;
 made-up batches at the paper's network sizes, no dataset needed. Times are the least of the repeats; the peak

@@ -1,4 +1,4 @@
-"""A context from which the rewards of other transitions of its task can be told.
+"""A method whose context predicts the rewards of other transitions of the task.
 
 Every transition of the context trajectories is encoded, and the context is the mean of all. A second network
 predicts the rewards of further trajectories from their states, their actions and the context; the squared
