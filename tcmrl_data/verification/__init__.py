@@ -1,1 +1,1 @@
-"""What `verify.py` looks with, and what follows from its findings: repair and the collection of garbage."""
+"""Verification and repair of datasets, and removal of abandoned files."""

@@ -1,4 +1,4 @@
-"""What a part's arrays must say: digests, episodes, values, flags, statistics, policy."""
+"""Checks of a part's content: digests, episodes, values, flags, statistics and policy."""
 
 import math
 import re
@@ -24,7 +24,7 @@ ContentProblem = tuple[str, str]
 """File or array within the part, and what is wrong with it."""
 
 CLOSE = 1e-9
-"""Relative tolerance of recomputed sums, which another machine may add up in another order."""
+"""Relative tolerance of recomputed sums; the order of summation may depend on the machine."""
 
 
 def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None) -> Iterator[ContentProblem]:

@@ -1,4 +1,4 @@
-"""What an ended build may leave behind and nobody needs: abandoned staging, checkpoints of finished tasks."""
+"""Removal of files that builds no longer need: abandoned staging and checkpoints of finished tasks."""
 
 import re
 from dataclasses import dataclass
@@ -27,8 +27,8 @@ class Garbage:
 
     Attributes:
         path: relative to the dataset.
-        reason: why nobody needs it.
-        bytes: of all files in it.
+        reason: why it is not needed.
+        bytes: size of all its files.
     """
 
     path: str
@@ -41,7 +41,7 @@ def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage
 
     Args:
         path: the dataset's folder or its `manifest.json`.
-        dry_run: only say what would be removed; changes nothing.
+        dry_run: only return what would be removed; change nothing.
 
     Raises:
         BuildError: there is no dataset at the path, or its work folders are links.

@@ -1,4 +1,4 @@
-"""Repair: rejected parts are made again beside the dataset, compared with the manifest, and put in place."""
+"""Repair: rebuilds rejected parts in the staging folder, checks their ids, and replaces the old ones."""
 
 import shutil
 import stat
@@ -35,7 +35,7 @@ from tcmrl_data.store.manifest import (
 from tcmrl_data.verification.verify import Finding, Key, VerifyLevel, verify_dataset
 
 REPAIR = "repair"
-"""Folder in `.staging` where parts are made again; after a killed repair the next one starts it anew."""
+"""Folder in `.staging` for rebuilt parts."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Replays: parts made again from their snapshots and seeds, and compared with what is stored."""
+"""Replays: rolls parts out again from their snapshots and seeds, and compares them with the stored arrays."""
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence

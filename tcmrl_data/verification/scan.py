@@ -1,4 +1,4 @@
-"""A list of everything that lies in a dataset's folder, without following a link or opening a file."""
+"""Lists everything in a dataset's folder without following links or opening files."""
 
 import os
 import stat

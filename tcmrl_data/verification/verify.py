@@ -1,7 +1,7 @@
-"""Verification: everything that is wrong with a dataset, file by file; damage is reported, never raised.
+"""Verification of a dataset, file by file; damage is reported as findings and not raised.
 
-`quick` looks at names, sizes, links and the allow-list; `digests` also hashes every file; `deep` also
-decodes every array and checks what it says (`contents.py`); `replay.py` makes parts again.
+`quick` checks names, sizes, links and the allow-list; `digests` also hashes every file; `deep` also decodes
+every array and checks its content (`contents.py`); `replay.py` rolls parts out again.
 """
 
 import re

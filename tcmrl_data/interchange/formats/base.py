@@ -1,4 +1,4 @@
-"""Formats write a dataset as another library reads it."""
+"""Base class of export formats, which write a dataset for another library."""
 
 import abc
 from collections.abc import Callable

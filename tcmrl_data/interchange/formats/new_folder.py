@@ -1,4 +1,4 @@
-"""An export's folder: it appears whole, or not at all."""
+"""The folder of an export, which is published atomically when it is complete."""
 
 import contextlib
 import shutil
@@ -12,7 +12,7 @@ from tcmrl_data.foundation.errors import StorageError, StoreError
 
 REMEDY = "nothing was exported; make room or choose an --out on another disk, then export again"
 FILE_BYTES = 2**16
-"""Room for what a file holds beside its episodes."""
+"""Bytes reserved for a file's content other than episodes."""
 
 COPIES = 4
 """A step is written at most this often: in its episode, and flat with its two observations."""
