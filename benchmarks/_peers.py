@@ -64,13 +64,14 @@ class Data:
 
 def flat_data(selection: tcmrl_data.Selection) -> Data:
     """All transitions of a selection as flat arrays."""
-    episodes = [each for task in selection.tasks for each in selection.trajectories(task.index)]
+    episodes = [episode for task in selection.tasks for episode in selection.trajectories(task.index)]
     horizon = len(episodes[0])
     columns = {
-        name: [getattr(each, name) for each in episodes] for name in ("actions", "rewards", "terminated")
+        name: [getattr(episode, name) for episode in episodes]
+        for name in ("actions", "rewards", "terminated")
     }
-    columns["observations"] = [each.observations[:-1] for each in episodes]
-    columns["next_observations"] = [each.observations[1:] for each in episodes]
+    columns["observations"] = [episode.observations[:-1] for episode in episodes]
+    columns["next_observations"] = [episode.observations[1:] for episode in episodes]
     arrays = {name: np.concatenate(columns[name]).astype(np.float32) for name in FIELDS}
     return Data(selection, arrays, horizon)
 
@@ -140,7 +141,7 @@ def sb3_buffers(data: Data, work: Work) -> Draws:
     def transitions() -> object:
         chosen = random.permutation(len(buffers))[: work.tasks]
         samples = [buffers[task].sample(work.transitions) for task in chosen]
-        return [torch.stack(each) for each in list(zip(*samples, strict=True))[:5]]
+        return [torch.stack(tensors) for tensors in list(zip(*samples, strict=True))[:5]]
 
     return {"transitions": transitions}
 
@@ -154,18 +155,18 @@ def minari_datasets(data: Data, work: Work, root: Path) -> dict[str, Draws]:
     os.environ["MINARI_DATASETS_PATH"] = str(root.resolve())
     tasks = [task.index for task in data.selection.tasks]
     opened = [minari.load_dataset(dataset_id(data.selection.dataset, task)) for task in tasks]
-    preloaded = [list(each.iterate_episodes()) for each in opened]
+    preloaded = [list(dataset.iterate_episodes()) for dataset in opened]
     random = np.random.default_rng(0)
 
     def stacked(episodes: list[minari.EpisodeData]) -> list[torch.Tensor]:
         fields = [
-            [each.observations[:-1] for each in episodes],
-            [each.actions for each in episodes],
-            [each.rewards for each in episodes],
-            [each.observations[1:] for each in episodes],
-            [each.terminations for each in episodes],
+            [episode.observations[:-1] for episode in episodes],
+            [episode.actions for episode in episodes],
+            [episode.rewards for episode in episodes],
+            [episode.observations[1:] for episode in episodes],
+            [episode.terminations for episode in episodes],
         ]
-        return [torch.from_numpy(np.stack(each).astype(np.float32, copy=False)) for each in fields]
+        return [torch.from_numpy(np.stack(arrays).astype(np.float32, copy=False)) for arrays in fields]
 
     def from_disk() -> object:
         chosen = random.permutation(len(opened))[: work.tasks]

@@ -54,7 +54,7 @@ def curves(recipe: Recipe, tasks: list[Task], seed: int) -> Returns:
         lanes = plan.environment.lanes([task.parameters] * recipe.rollouts.lanes)
         episodes = roll_out_part(plan, task=task, snapshot=snapshot, lanes=lanes)
         lanes.close()
-        found[task.index].append(np.mean([each.undiscounted_return for each in episodes]))
+        found[task.index].append(np.mean([episode.undiscounted_return for episode in episodes]))
     return np.array([found[task.index][1:] for task in tasks])
 
 

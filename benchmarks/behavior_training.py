@@ -99,7 +99,7 @@ def rows(seconds: float, groups: list[int]) -> Iterator[dict[str, Any]]:
             "task_steps_per_second": base,
             "times_sac": 1.0,
         }
-        for num_tasks, precision in [*((each, "highest") for each in groups), (MEDIUM_GROUP, "medium")]:
+        for num_tasks, precision in [*((group, "highest") for group in groups), (MEDIUM_GROUP, "medium")]:
             override = f"behavior.stacked.matmul_precision={precision}"
             rate = measure(recipe_of(name, "stacked", width, batch_size, override), num_tasks, seconds)
             measured = {"task_steps_per_second": rate, "times_sac": rate / base}

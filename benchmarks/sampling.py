@@ -103,11 +103,13 @@ def measure(folder: Path, repeats: int) -> dict[str, Any]:
         "peak_rss_bytes": peak,
         "ours_over_peers": {name: _ratios(rates["ours"], rates[name]) for name in peers},
         "ours_over_memcpy": {
-            kind: _ratio([rate * sizes[kind] for rate in each], copied)
-            for kind, each in rates["ours"].items()
+            kind: _ratio([rate * sizes[kind] for rate in values], copied)
+            for kind, values in rates["ours"].items()
         },
         "open_over_read": _ratio(*opening.values()),
-        "spread": {name: _spread(each) for name, each in (opening | {"memcpy_bytes_per_s": copied}).items()},
+        "spread": {
+            name: _spread(values) for name, values in (opening | {"memcpy_bytes_per_s": copied}).items()
+        },
         "repeats": repeats,
         "cores": os.cpu_count(),
         "machine": platform.machine(),
@@ -195,19 +197,19 @@ def _race(
 ) -> tuple[dict[str, dict[str, list[float]]], list[float]]:
     """Batches per second by contestant, kind and repetition, and bytes per second of a streaming copy."""
     rates: dict[str, dict[str, list[float]]] = {
-        name: {kind: [] for kind in each} for name, each in draws.items()
+        name: {kind: [] for kind in kind_draws} for name, kind_draws in draws.items()
     }
     copied: list[float] = []
     source, target = np.ones((2, COPIED_BYTES), dtype=np.uint8)
     for repetition in range(repeats + 1):
         copied.append(COPIED_BYTES * _rate(lambda: np.copyto(target, source)))
-        for name, each in draws.items():
-            for kind, draw in each.items():
+        for name, kind_draws in draws.items():
+            for kind, draw in kind_draws.items():
                 rates[name][kind].append(_rate(draw))
         if repetition == 0:  # warms up
             copied.clear()
-            for each in rates.values():
-                for values in each.values():
+            for kind_rates in rates.values():
+                for values in kind_rates.values():
                     values.clear()
     return rates, copied
 
@@ -235,7 +237,7 @@ def _rates(rates: Mapping[str, list[float]], sizes: Mapping[str, int]) -> dict[s
 
 
 def _ratios(ours: Mapping[str, list[float]], theirs: Mapping[str, list[float]]) -> dict[str, Any]:
-    return {kind: _ratio(ours[kind], each) for kind, each in theirs.items()}
+    return {kind: _ratio(ours[kind], values) for kind, values in theirs.items()}
 
 
 def _ratio(ones: list[float], others: list[float]) -> dict[str, Any]:

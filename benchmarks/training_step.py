@@ -51,9 +51,9 @@ CASES = {
 }
 BASE = Sizes(17, 6, 1, 100)
 GROWTH = {
-    "tasks": [Sizes(17, 6, 1, 100, tasks=each) for each in (4, 8, 16, 32)],
-    "steps": [Sizes(17, 6, 1, each) for each in (50, 100, 200, 400)],
-    "windows": [Sizes(17, 6, 1, 100, windows=each) for each in (64, 128, 256, 512)],
+    "tasks": [Sizes(17, 6, 1, 100, tasks=tasks) for tasks in (4, 8, 16, 32)],
+    "steps": [Sizes(17, 6, 1, steps) for steps in (50, 100, 200, 400)],
+    "windows": [Sizes(17, 6, 1, 100, windows=windows) for windows in (64, 128, 256, 512)],
 }
 
 
@@ -158,8 +158,8 @@ def needed_work(made: ContextAlgorithm, sizes: Sizes) -> int:
     """Operations of the perceptrons that the method asks for, gradients that no one reads left out."""
 
     def widths(network: nn.Module) -> list[int]:
-        layers = [each for each in network.modules() if isinstance(each, nn.Linear)]
-        return [layers[0].in_features, *(each.out_features for each in layers)]
+        layers = [module for module in network.modules() if isinstance(module, nn.Linear)]
+        return [layers[0].in_features, *(layer.out_features for layer in layers)]
 
     actor_critic, learner = made.actor_critic, made.learner
     rows, action = sizes.tasks * sizes.transitions, sizes.action_dim
@@ -196,7 +196,7 @@ def measure(sizes: Sizes, *, algorithm: str, precision: str, repeats: int) -> di
         walls.append(time.perf_counter() - began)
         processors.append(time.process_time() - processor)
     needed = needed_work(made, sizes)
-    peak, peak_by_processor = (max(each) for each in zip(*peaks, strict=True))
+    peak, peak_by_processor = (max(values) for values in zip(*peaks, strict=True))
     return {
         "sizes": vars(sizes),
         "milliseconds": 1e3 * min(walls),
@@ -229,8 +229,8 @@ def components(sizes: Sizes, *, algorithm: str, precision: str, repeats: int) ->
     for step in range(2, 2 + repeats):
         watch.seconds.clear()
         made.update(batch, step)
-        for name, each in watch.seconds.items():
-            least[name] = min(least.get(name, float("inf")), 1e3 * each)
+        for name, seconds in watch.seconds.items():
+            least[name] = min(least.get(name, float("inf")), 1e3 * seconds)
     return least
 
 
@@ -253,7 +253,7 @@ def main() -> None:
         "load_average": os.getloadavg()[0],
         "steps": {name: measure(sizes, **how) for name, sizes in CASES.items()},
         "growth": {
-            name: [{**vars(each), "gigaflop": measure(each, **how)["gigaflop_done"]} for each in cases]
+            name: [{**vars(case), "gigaflop": measure(case, **how)["gigaflop_done"]} for case in cases]
             for name, cases in GROWTH.items()
         },
         "components_milliseconds": {name: components(sizes, **how) for name, sizes in CASES.items()},

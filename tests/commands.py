@@ -14,7 +14,7 @@ def in_process(command: click.Command, capsys: pytest.CaptureFixture[str]) -> Ca
     """Runs a root command in this process."""
 
     def call(*arguments: object) -> tuple[int, str, str]:
-        code = run(command, [str(each) for each in arguments])
+        code = run(command, [str(argument) for argument in arguments])
         captured = capsys.readouterr()
         return code, captured.out, captured.err
 

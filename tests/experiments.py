@@ -55,7 +55,7 @@ def _lines(table: dict[str, Any], prefix: str) -> list[str]:
         if isinstance(value, dict):
             found += _lines(value, f"{name}.") if value else [f"{name} = {{}}"]
         elif value and isinstance(value, list) and isinstance(value[0], dict):
-            items = ", ".join("{" + ", ".join(_lines(each, "")) + "}" for each in value)
+            items = ", ".join("{" + ", ".join(_lines(entry, "")) + "}" for entry in value)
             found.append(f"{name} = [{items}]")
         else:
             found.append(f"{name} = {json.dumps(value)}")

@@ -121,7 +121,7 @@ class Forge:
 
     @staticmethod
     def _name_part(manifest: Values, part_id: str, sealed: str) -> None:
-        entry = next(each for each in manifest["parts"] if each["task"] == TASKS[0])
+        entry = next(part for part in manifest["parts"] if part["task"] == TASKS[0])
         entry |= {"id": part_id, "sha256": sealed}
 
 

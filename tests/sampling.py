@@ -14,7 +14,7 @@ def rows_of(tasks: Sequence[Sequence[Trajectory]]) -> PackedRows:
     """The packed rows of some tasks' episodes, a part per task."""
     first = tasks[0][0]
     observation_dim, action_dim = first.observations.shape[1], first.actions.shape[1]
-    counts = [sum(len(each) + 1 for each in task) for task in tasks]
+    counts = [sum(len(episode) + 1 for episode in task) for task in tasks]
     table = np.zeros((sum(counts) + max(counts), observation_dim + action_dim + 2), dtype=np.float32)
     lengths, start = [], 0
     for task, count in zip(tasks, counts, strict=True):
@@ -43,6 +43,6 @@ def numbered(task: int, episode: int, steps: int) -> Trajectory:
 def numbered_tasks(lengths: Sequence[Sequence[int]]) -> list[list[Trajectory]]:
     """Numbered episodes of the given lengths, per task."""
     return [
-        [numbered(task, episode, steps) for episode, steps in enumerate(each)]
-        for task, each in enumerate(lengths)
+        [numbered(task, episode, steps) for episode, steps in enumerate(task_lengths)]
+        for task, task_lengths in enumerate(lengths)
     ]

@@ -46,8 +46,8 @@ def test_each_loss_trains_its_own_network() -> None:
         metrics[loss].backward()  # type: ignore[no-untyped-call]
         touched = {
             name.split(".")[0]
-            for name, each in actor_critic.named_parameters()
-            if each.grad is not None and each.grad.any()
+            for name, parameter in actor_critic.named_parameters()
+            if parameter.grad is not None and parameter.grad.any()
         }
         assert touched == {network}
 

@@ -37,14 +37,14 @@ def terminated_early(original: Callable[..., list[Trajectory]]) -> Callable[...,
 
     def trajectories(self: Dataset, task: int, step: int) -> list[Trajectory]:
         result = []
-        for index, each in enumerate(original(self, task, step)):
-            steps = len(each) - index
+        for index, episode in enumerate(original(self, task, step)):
+            steps = len(episode) - index
             ended = np.arange(steps) == steps - 1
             result.append(
                 Trajectory(
-                    each.observations[: steps + 1],
-                    each.actions[:steps],
-                    each.rewards[:steps],
+                    episode.observations[: steps + 1],
+                    episode.actions[:steps],
+                    episode.rewards[:steps],
                     ended & (index % 2 == 1),
                     ended & (index % 2 == 0),
                     {"success": ended & (index == 2)},
@@ -62,7 +62,9 @@ def uneven(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def episodes_of(selection: Selection) -> list[tuple[int, Trajectory]]:
-    return [(task.index, each) for task in selection.tasks for each in selection.trajectories(task.index)]
+    return [
+        (task.index, episode) for task in selection.tasks for episode in selection.trajectories(task.index)
+    ]
 
 
 def test_torch_dataset_serves_every_episode_in_order(tiny: Dataset, uneven: None) -> None:
@@ -124,15 +126,15 @@ def test_sb3_buffer_is_what_adding_every_step_gives(tiny: Dataset, uneven: None)
     selection = tiny.select(snapshots="steps>=100")
     filled = to_sb3_buffer(selection, 3)
     added = ReplayBuffer(2 * 105, filled.observation_space, filled.action_space, device="cpu")
-    for each in selection.trajectories(3):
-        for t in range(len(each)):
+    for episode in selection.trajectories(3):
+        for t in range(len(episode)):
             added.add(
-                each.observations[t],
-                each.observations[t + 1],
-                each.actions[t],
-                each.rewards[t],
-                np.array(each.terminated[t] or each.truncated[t]),
-                [{"TimeLimit.truncated": bool(each.truncated[t])}],
+                episode.observations[t],
+                episode.observations[t + 1],
+                episode.actions[t],
+                episode.rewards[t],
+                np.array(episode.terminated[t] or episode.truncated[t]),
+                [{"TimeLimit.truncated": bool(episode.truncated[t])}],
             )
     assert (filled.size(), filled.full, filled.pos) == (added.size(), added.full, added.pos)
     for name in ("observations", "next_observations", "actions", "rewards", "dones", "timeouts"):
@@ -158,19 +160,19 @@ def test_tensordict_holds_every_transition(tiny: Dataset, uneven: None) -> None:
     episodes = episodes_of(selection)
     assert data.batch_size == torch.Size([5 * 105])
     assert data["next", "reward"].shape == data["done"].shape == (5 * 105, 1)
-    for number, (task, each) in enumerate(episodes):
+    for number, (task, episode) in enumerate(episodes):
         part = data[data["episode"] == number]
         assert (len(part), part["task"].unique().item(), part["step"].unique().item()) == (
-            len(each),
+            len(episode),
             task,
             150,
         )
-        np.testing.assert_array_equal(part["observation"], each.observations[:-1])
-        np.testing.assert_array_equal(part["next", "observation"], each.observations[1:])
-        np.testing.assert_array_equal(part["action"], each.actions)
-        np.testing.assert_array_equal(part["next", "reward"][:, 0], each.rewards)
-        np.testing.assert_array_equal(part["next", "terminated"][:, 0], each.terminated)
-        np.testing.assert_array_equal(part["next", "truncated"][:, 0], each.truncated)
+        np.testing.assert_array_equal(part["observation"], episode.observations[:-1])
+        np.testing.assert_array_equal(part["next", "observation"], episode.observations[1:])
+        np.testing.assert_array_equal(part["action"], episode.actions)
+        np.testing.assert_array_equal(part["next", "reward"][:, 0], episode.rewards)
+        np.testing.assert_array_equal(part["next", "terminated"][:, 0], episode.terminated)
+        np.testing.assert_array_equal(part["next", "truncated"][:, 0], episode.truncated)
     assert data["next", "done"].sum() == len(episodes)
     assert not any(data[name].any() for name in ("done", "terminated", "truncated"))
 
@@ -210,7 +212,7 @@ def test_minari_opens_iterates_and_samples_what_was_exported(
             np.testing.assert_array_equal(episode.truncations, original.truncated)
             np.testing.assert_array_equal(episode.infos["success"][1:], original.extras["success"])
         assert len(opened.sample_episodes(5)) == 5
-        steps = [each["snapshot_step"] for each in opened.storage.get_episode_metadata(range(12))]
+        steps = [entry["snapshot_step"] for entry in opened.storage.get_episode_metadata(range(12))]
         assert steps == [100] * 6 + [150] * 6
 
 
@@ -242,10 +244,13 @@ def test_minari_knows_the_scores_and_makes_the_task_again(
     assert metadata["ref_max_score_source"] == "oracle"
     assert metadata["algorithm_name"] == "sac"
     assert tiny.manifest.root in metadata["description"]
-    assert {each.partition("==")[0] for each in metadata["requirements"]} >= {"tcmrl", "gymnasium"}
+    assert {requirement.partition("==")[0] for requirement in metadata["requirements"]} >= {
+        "tcmrl",
+        "gymnasium",
+    }
     environment = opened.recover_environment(eval_env=True)
     episode = opened[0]
-    seeds = [each["seed"] for each in opened.storage.get_episode_metadata(range(6))]
+    seeds = [entry["seed"] for entry in opened.storage.get_episode_metadata(range(6))]
     assert seeds == [
         keyed_seed(0, "point-robot", 40, Purpose.ROLLOUT_RESET, 150, index) for index in range(6)
     ]

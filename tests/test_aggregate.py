@@ -20,7 +20,7 @@ def test_fewer_than_five_seeds_get_no_interval_but_stand_there() -> None:
 def test_interval_is_that_of_all_equally_likely_resamples() -> None:
     values = [0.0, 1.0, 2.0, 4.0, 13.0]
     found = summarize(values)
-    means = [np.mean(each) for each in itertools.product(values, repeat=5)]  # all 3,125 resamples
+    means = [np.mean(resample) for resample in itertools.product(values, repeat=5)]  # all 3,125 resamples
     low, high = np.quantile(means, [0.025, 0.975])
     assert found.low == pytest.approx(low, abs=0.2)
     assert found.high == pytest.approx(high, abs=0.2)
@@ -30,7 +30,7 @@ def test_interval_is_that_of_all_equally_likely_resamples() -> None:
 
 def test_verdicts_intervals_hold_the_mean_as_often_as_they_say() -> None:
     draws = np.random.default_rng(0).normal(size=(2_000, 5))
-    intervals = [mean_interval(each.tolist()) for each in draws]
+    intervals = [mean_interval(draw.tolist()) for draw in draws]
     held = np.mean([low <= 0.0 <= high for low, high in filter(None, intervals)])
     assert 0.94 < held < 0.96
     assert mean_interval([2.0] * 5) == (2.0, 2.0)

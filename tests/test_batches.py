@@ -36,9 +36,9 @@ def open_with(dataset: Dataset, *overrides: str, algorithm: str = "tcmrl") -> St
 
 
 def test_joined_batches_take_each_kind_from_its_selection(tiny: Dataset) -> None:
-    last, whole = (tiny.select(split="train", snapshots=each) for each in ("last", "all"))
-    stored = [each for task in last.tasks for each in last.trajectories(task.index)]
-    own = {float(reward) for each in stored for reward in each.rewards}
+    last, whole = (tiny.select(split="train", snapshots=rule) for rule in ("last", "all"))
+    stored = [trajectory for task in last.tasks for trajectory in last.trajectories(task.index)]
+    own = {float(reward) for trajectory in stored for reward in trajectory.rewards}
     request = BatchRequest(
         tasks=3,
         kinds={
@@ -52,10 +52,10 @@ def test_joined_batches_take_each_kind_from_its_selection(tiny: Dataset) -> None
     transitions, contexts = (open_sampler(selection, half, seed=0) for selection, half in samplers)
     joined = JoinedBatches(transitions, contexts)
     batches = [joined.batch(n) for n in range(10)]
-    assert all(each["policy"].rewards.shape == (3, 9) for each in batches)
-    assert all(set(each["policy"].rewards.flatten().tolist()) <= own for each in batches)
+    assert all(batch["policy"].rewards.shape == (3, 9) for batch in batches)
+    assert all(set(batch["policy"].rewards.flatten().tolist()) <= own for batch in batches)
     for part in ("context", "execution", "windows"):
-        seen = {value for each in batches for value in each[part].rewards.flatten().tolist()}
+        seen = {value for batch in batches for value in batch[part].rewards.flatten().tolist()}
         assert not seen <= own, part
     assert joined.moments().reward_mean == transitions.moments().reward_mean
 
@@ -69,9 +69,9 @@ def test_contexts_from_the_same_snapshots_are_those_of_one_selection(tiny: Datas
         first, second = one.batch(n), two.batch(n)
         assert set(first.names()) == set(second.names())
         for part in first.names():
-            for each in fields(first[part]):
-                found = [getattr(batch[part], each.name) for batch in (first, second)]
-                assert found == [None, None] or torch.equal(*found), (n, part, each.name)
+            for field in fields(first[part]):
+                found = [getattr(batch[part], field.name) for batch in (first, second)]
+                assert found == [None, None] or torch.equal(*found), (n, part, field.name)
 
 
 def test_an_algorithm_without_contexts_draws_none(tiny: Dataset) -> None:

@@ -120,11 +120,11 @@ def test_what_is_read_is_never_evicted(
     sampler = open_sampler(selection, REQUEST, seed=0, memory_limit=1)
     expected = open_sampler(selection, REQUEST, seed=0).batch(3)
     cached_rows(tiny.select(split="train", snapshots="last"))
-    assert [each.in_use for each in list_cache()] == [True, False]
+    assert [entry.in_use for entry in list_cache()] == [True, False]
     assert len(clear_cache()) == 1
     assert sampler.batch(3)["context"].rewards.equal(expected["context"].rewards)
     del sampler
-    assert [each.in_use for each in list_cache()] == [False]
+    assert [entry.in_use for entry in list_cache()] == [False]
     assert len(clear_cache()) == 1 and not entries(folder)
 
 
@@ -146,15 +146,15 @@ def test_another_process_keeps_its_entry_too(selection: Selection, tiny_folder: 
 def test_what_was_used_longest_ago_goes_first(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
     """Three entries of one size where two have room; the older one of the first two was used again."""
     old, older, new = (tiny.select(tasks=[0, other]) for other in (40, 60, 99))
-    for age, each in enumerate((old, older)):
-        cached_rows(each)
+    for age, selection in enumerate((old, older)):
+        cached_rows(selection)
         key = next(entry.key for entry in list_cache() if entry.used > 2000)
         os.utime(cache.cache_folder() / "rows" / key / "record.json", (1000 + age, 1000 + age))
     cached_rows(old)
     first, second = list_cache()
     monkeypatch.setenv("TCMRL_CACHE_LIMIT", str(first.bytes + second.bytes))
     cached_rows(new)
-    left = {each.key for each in list_cache()}
+    left = {entry.key for entry in list_cache()}
     assert len(left) == 2 and first.key not in left and second.key in left
 
 
@@ -174,7 +174,7 @@ def test_a_damaged_part_leaves_no_entry(tiny_copy: Callable[[], Path], folder: P
     with pytest.raises(StoreError, match=r"rewards/c/0 does not decode.*repair"):
         cached_rows(dataset.select())
     assert not (folder / "rows").exists() or not entries(folder)
-    assert not [each for each in (folder / ".staging").iterdir() if each.suffix != ".lock"]
+    assert not [path for path in (folder / ".staging").iterdir() if path.suffix != ".lock"]
 
 
 def test_decoding_takes_the_memory_of_the_parts_at_work(

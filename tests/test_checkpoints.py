@@ -63,7 +63,10 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
     tmp_path: Path, name: str, overrides: tuple[str, ...], stop_at: int
 ) -> None:
     recipe = load_recipe(name, profile="quick", overrides=overrides)
-    straight = {each.step: each.digest() for each in trained(recipe, tmp_path / "straight", seconds=np.inf)}
+    straight = {
+        snapshot.step: snapshot.digest()
+        for snapshot in trained(recipe, tmp_path / "straight", seconds=np.inf)
+    }
     resumed: dict[int, str] = {}
     interrupted = trained(recipe, tmp_path, stop_at=stop_at)
     with pytest.raises(Interrupted):
@@ -71,7 +74,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
     state = folder(tmp_path).load()
     assert state is not None
     assert 0 < state.values["steps"] < stop_at
-    later = {each.step: each.digest() for each in trained(recipe, tmp_path)}
+    later = {snapshot.step: snapshot.digest() for snapshot in trained(recipe, tmp_path)}
     assert set(later) == {step for step in straight if step > state.values["steps"]}
     assert resumed | later == straight
 

@@ -219,7 +219,7 @@ def test_a_bad_manifest_is_refused_by_every_command(
 def test_every_help_has_an_example(call: Call) -> None:
     for name, command in data.commands.items():
         within = list(command.commands) if isinstance(command, click.Group) else []
-        for words in [[name, each] for each in within] or [[name]]:
+        for words in [[name, subcommand] for subcommand in within] or [[name]]:
             assert "Example" in call(*words, "--help")[1]
         assert command.help
 

@@ -68,7 +68,7 @@ def test_inspect_returns_equals_sums_over_the_stored_rewards(call: Call, tiny: D
     assert document["environment"] == "point-robot"
     assert [task["task"] for task in document["tasks"]] == TASKS
     for task in document["tasks"]:
-        assert [each["step"] for each in task["snapshots"]] == [0, 100, 150]
+        assert [snapshot["step"] for snapshot in task["snapshots"]] == [0, 100, 150]
         for row in task["snapshots"]:
             arrays = tiny.arrays(task["task"], row["step"])
             offsets = arrays["episode_offsets"]
@@ -164,7 +164,7 @@ def test_inspect_episodes_of_one_part(call: Call, tiny: Dataset) -> None:
     selection = ("--task", 40, "--step", 100)
     rows = json.loads(call("inspect", "episodes", tiny.folder, *selection, "--json")[1])["episodes"]
     trajectories = tiny.trajectories(40, 100)
-    assert [row["return"] for row in rows] == [each.undiscounted_return for each in trajectories]
+    assert [row["return"] for row in rows] == [trajectory.undiscounted_return for trajectory in trajectories]
     assert all(row["truncated"] and not row["terminated"] and row["length"] == 20 for row in rows)
     assert all(row["success"] is None for row in rows)
     assert call("inspect", "episodes", tiny.folder, *selection)[1].count("truncated") == 6

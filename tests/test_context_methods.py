@@ -26,7 +26,7 @@ from tests.made_up import TASKS, batch, problem, settings, trajectory, with_step
 
 def test_every_step_has_its_own_generator() -> None:
     places = [(1, 0), (2, 0), (1, 1), (1, 0)]
-    draws = [torch.rand(3, generator=problem().generator(*each)) for each in places]
+    draws = [torch.rand(3, generator=problem().generator(*place)) for place in places]
     assert torch.equal(draws[0], draws[3])
     assert not torch.equal(draws[0], draws[1])
     assert not torch.equal(draws[0], draws[2])
@@ -72,10 +72,10 @@ def test_focal_pulls_the_means_of_a_tasks_trajectories_together() -> None:
     context, execution = made.encoder(*groups)
     single = torch.stack(
         [
-            torch.stack([each[mask].mean(dim=0) for each, mask in zip(lane, real, strict=True)])
+            torch.stack([row[mask].mean(dim=0) for row, mask in zip(lane, real, strict=True)])
             for lane, real in zip(
                 torch.cat([context, execution], dim=1),
-                torch.cat([each.mask for each in groups], dim=1),
+                torch.cat([group.mask for group in groups], dim=1),
                 strict=True,
             )
         ]
@@ -99,7 +99,7 @@ def test_focal_gathers_each_tasks_contexts() -> None:
 
     def ratio() -> float:
         parts = (values["context"], values["execution"])
-        contexts = torch.stack([made.learner.context(each) for each in parts]).detach()
+        contexts = torch.stack([made.learner.context(part) for part in parts]).detach()
         within = (contexts[0] - contexts[1]).norm(dim=-1).mean()
         between = (contexts[0].roll(1, 0) - contexts[1]).norm(dim=-1).mean()
         return float(within / between)

@@ -41,7 +41,7 @@ def test_rewards_are_of_the_state_after_the_move(tiny: Dataset) -> None:
 
 def test_recorded_statistics_are_those_of_the_arrays(tiny: Dataset) -> None:
     statistics = tiny.part(40, 100).statistics
-    returns = [each.undiscounted_return for each in tiny.trajectories(40, 100)]
+    returns = [trajectory.undiscounted_return for trajectory in tiny.trajectories(40, 100)]
     assert (statistics.mean, statistics.min) == pytest.approx((np.mean(returns), np.min(returns)))
     rows = tiny.arrays(40, 100)["observations"].astype(np.float64)
     np.testing.assert_allclose(statistics.moments["observations"]["sum"], rows.sum(0))

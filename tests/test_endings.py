@@ -106,7 +106,10 @@ def test_endings_from_the_cache_are_those_from_memory(
     for name in KINDS:
         for field in FIELDS:
             assert torch.equal(getattr(left[name], field), getattr(right[name], field)), (name, field)
-    stored = {float(each.rewards[0]): each for each in selection.trajectories(int(left.task_indices[0]))}
+    stored = {
+        float(trajectory.rewards[0]): trajectory
+        for trajectory in selection.trajectories(int(left.task_indices[0]))
+    }
     context = left["context"]
     assert context.returns_to_go is not None
     for rewards, returns in zip(context.rewards[0], context.returns_to_go[0], strict=True):

@@ -199,7 +199,9 @@ def test_a_poison_unit_is_named_the_others_are_done_and_the_exit_code_is_1(
     assert (len(poison.died()), driver.returncode) == (2, 1), errors
     assert "Error: task 3 failed after 2 attempt(s) on " in errors
     assert "killed by signal 9" in errors
-    assert ids(out) == {key: each for key, each in ids(tiny_folder, 0, 3, 40).items() if key != (3, 150)}
+    assert ids(out) == {
+        key: part_id for key, part_id in ids(tiny_folder, 0, 3, 40).items() if key != (3, 150)
+    }
     assert not read_manifest(out).complete
 
 
@@ -207,7 +209,7 @@ def test_a_poison_unit_is_named_the_others_are_done_and_the_exit_code_is_1(
     ("engine", "number"),
     [
         pytest.param("local", signal.SIGINT, id="local-SIGINT"),
-        *(pytest.param(*each.values, signal.SIGTERM, marks=each.marks) for each in CASES),
+        *(pytest.param(*case.values, signal.SIGTERM, marks=case.marks) for case in CASES),
     ],
     indirect=["engine"],
 )

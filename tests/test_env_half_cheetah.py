@@ -14,7 +14,7 @@ from tests.environments import Still, actions_of, environment_of, episodes, para
 
 def test_a_cheetah_that_stands_still_returns_minus_305() -> None:
     environment, tasks = environment_of("half-cheetah-vel"), list(parameters_of("half-cheetah-vel"))
-    velocities = np.array([each["velocity"] for each in tasks])
+    velocities = np.array([task["velocity"] for task in tasks])
     assert velocities.min() >= 0.0 and velocities.max() <= 3.0
     played = episodes(environment, Still(), tasks)
     assert not any(episode.terminated.any() for episode in played)

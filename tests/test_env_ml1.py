@@ -76,7 +76,7 @@ def test_the_expert_succeeds_and_noise_hinders_it() -> None:
     assert all(episode.extras["success"].any() for episode in best)
     assert best[0].extras["success"].dtype == np.bool_
     hindered = episodes(environment, noisy, tasks)
-    returns = [np.mean([each.undiscounted_return for each in group]) for group in (best, hindered)]
+    returns = [np.mean([episode.undiscounted_return for episode in group]) for group in (best, hindered)]
     assert returns[0] > returns[1]
 
 

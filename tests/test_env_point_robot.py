@@ -10,11 +10,11 @@ def test_winds_are_drawn_as_the_field_draws_them() -> None:
     first = parameters_of("point-robot-wind")[0]
     assert first["goal"] == [1.0, 0.0]
     assert first["wind"] == pytest.approx([-0.02380, 0.03360], abs=5e-6)
-    assert np.abs([each["wind"] for each in parameters_of("point-robot-wind")]).max() <= 0.05
+    assert np.abs([task["wind"] for task in parameters_of("point-robot-wind")]).max() <= 0.05
 
 
 def test_goals_lie_on_the_half_circle() -> None:
-    goals = np.array([each["goal"] for each in parameters_of("point-robot")])
+    goals = np.array([task["goal"] for task in parameters_of("point-robot")])
     assert goals[[0, -1]] == pytest.approx(np.array([[1.0, 0.0], [-1.0, 0.0]]))
     assert np.linalg.norm(goals, axis=1) == pytest.approx(1.0)
     assert goals[33] == pytest.approx([0.5, np.sqrt(0.75)])  # a third of the way, 60 degrees
@@ -35,8 +35,8 @@ def test_sparse_rewards_in_both_readings(reading: str, inside: float, oracle: fl
     environment = environment_of("sparse-point-robot", f"environment.sparse_reward='{reading}'")
     task = {"goal": [0.1, 0.1], "wind": [0.0, 0.0]}
     env, dense = environment.make(task), environment.make(task, reward="dense")
-    for each in (env, dense):
-        each.reset(seed=0)
+    for variant in (env, dense):
+        variant.reset(seed=0)
     right = np.array([1.0, 0.0], dtype=np.float32)
     assert env.step(right)[1] == pytest.approx(inside)  # 0.1 from the goal
     assert dense.step(right)[1] == pytest.approx(-0.1)
@@ -47,7 +47,7 @@ def test_sparse_rewards_in_both_readings(reading: str, inside: float, oracle: fl
     tasks = list(parameters_of("sparse-point-robot"))
     controller = environment.oracle(tasks)
     assert controller is not None
-    returns = [each.undiscounted_return for each in episodes(environment, controller, tasks)]
+    returns = [episode.undiscounted_return for episode in episodes(environment, controller, tasks)]
     # goals at the ends of the half circle pass exactly the radius, where rounding decides on 0.8
     assert np.mean(returns) == pytest.approx(oracle, abs=0.02)
 
@@ -65,10 +65,10 @@ def test_a_point_robot_never_terminates_not_even_at_its_goal(name: str) -> None:
 def test_wind_oracle_and_blindness() -> None:
     environment, tasks = environment_of("point-robot-wind"), list(parameters_of("point-robot-wind"))
     knowing = environment.oracle(tasks)
-    blind = environment.oracle([each | {"wind": [0.0, 0.0]} for each in tasks])
+    blind = environment.oracle([task | {"wind": [0.0, 0.0]} for task in tasks])
     assert knowing is not None and blind is not None
     means = [
-        np.mean([each.undiscounted_return for each in episodes(environment, controller, tasks)])
+        np.mean([episode.undiscounted_return for episode in episodes(environment, controller, tasks)])
         for controller in (knowing, blind, Still())
     ]
     assert means == pytest.approx([-5.11, -5.65, -28.2], abs=0.05)

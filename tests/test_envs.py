@@ -80,7 +80,7 @@ def test_parameters_are_json_and_rebuild_the_task(name: str) -> None:
     environment, parameters = environment_of(name), parameters_of(name)
     restored = json.loads(json.dumps(parameters))
     assert restored == list(parameters)
-    assert len({json.dumps(each) for each in parameters}) == len(parameters) == environment.settings.tasks
+    assert len({json.dumps(task) for task in parameters}) == len(parameters) == environment.settings.tasks
     actions = actions_of(environment)
     again = play(environment.make(restored[2]), actions, seed=1)
     assert again == play(environment.make(parameters[2]), actions, seed=1)

@@ -168,7 +168,7 @@ def test_evaluate_command_compares_all_protocols(trained: Path, call: Call) -> N
     for text in ("paper", "adapted", "regret", "other", "uniform", "oracle", "mean"):
         assert text in output
     code, output, _ = call("evaluate", trained, "--protocol", "all", "--json")
-    assert [each["protocol"] for each in json.loads(output)] == PROTOCOLS.names()
+    assert [entry["protocol"] for entry in json.loads(output)] == PROTOCOLS.names()
 
 
 def test_evaluations_by_every_protocol_fit_a_terminal_with_every_number_whole(trained: Path) -> None:

@@ -48,8 +48,8 @@ def test_running_failed_and_rate_come_from_the_latest_build(
     lines += [event("unit_failed", "task 7", 100, "task 7 failed: why"), event("steps", "task 9", 150)]
     stop_the_clock(monkeypatch)
     with EventLog(folder, lambda _: None) as log:
-        for each in lines:
-            log.write(each)
+        for entry in lines:
+            log.write(entry)
     rewritten = []
     for second, line in enumerate((folder / EVENTS).read_text().splitlines()):
         rewritten.append(json.dumps(json.loads(line) | {"time": 1000.0 + 10 * second}))
@@ -82,7 +82,7 @@ def test_steps_are_recorded_at_most_once_a_second_but_all_are_reported(
 def test_status_of_a_running_build_from_another_process(tmp_path: Path) -> None:
     out, directions = tmp_path / "running", Directions(str(tmp_path / "directions")).hold()
     options = ["--profile", "quick", "--tasks", "0,3", "--workers", "1", "--quiet", "--out", str(out)]
-    options += [word for each in TINY for word in ("--set", each)]
+    options += [word for override in TINY for word in ("--set", override)]
     with command_line("build", "point-robot", *options, directions=directions) as builder:
         directions.wait(builder)
         with command_line("status", str(out), "--json") as asker:

@@ -47,7 +47,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Pat
     events: list[EndedRun] = []
     report = run_experiment(_small(tiny_folder), out, workers=2, report=events.append)
     assert (report.present, report.failed, len(report.results)) == (0, (), 4)
-    assert [(each.done, each.total) for each in events] == [(done, 4) for done in (1, 2, 3, 4)]
+    assert [(event.done, event.total) for event in events] == [(done, 4) for done in (1, 2, 3, 4)]
     assert events[-1].seconds_left == 0
     return out
 
@@ -57,15 +57,15 @@ def _small(dataset: Path, **changes: Any) -> Experiment:
 
 
 def test_one_document_per_run_and_one_table(finished: Path, tiny_folder: Path) -> None:
-    assert {each.stem for each in finished.glob("runs/*.json")} == FILES
+    assert {path.stem for path in finished.glob("runs/*.json")} == FILES
     result = read_record(RunResult, finished / "runs/point-robot--tcmrl--seed1.json")
     run = open_run(finished / "runs/point-robot--tcmrl--seed1")
     assert result.root == tcmrl_data.open_dataset(tiny_folder).manifest.root
     assert (result.method, result.seed, result.steps) == ("TCMRL", 1, 40)
     assert result.config == run.record.config
     assert result.config.method["latent"] == 4
-    assert [each.step for each in result.curve] == [20, 40]
-    assert sum(each.timed_steps for each in result.curve) == 40
+    assert [point.step for point in result.curve] == [20, 40]
+    assert sum(point.timed_steps for point in result.curve) == 40
     assert list(result.evaluations) == ["offline", "paper"]
     assert result.evaluations["offline"]["mean_final"] == result.curve[-1].final
     assert result.training_seconds is not None and result.training_seconds > 0
@@ -81,13 +81,13 @@ def test_a_second_call_does_nothing_and_says_the_same(
     finished: Path, tiny_folder: Path, tmp_path: Path, call: Call
 ) -> None:
     file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
-    before = {each: each.stat().st_mtime_ns for each in finished.glob("runs/*.json")}
+    before = {path: path.stat().st_mtime_ns for path in finished.glob("runs/*.json")}
     code, output, errors = call("experiment", file, "--out", finished, "--json")
     document = json.loads(output)
     assert (code, errors) == (0, "")
     assert (document["ran"], document["present"], document["failed"]) == (0, 4, [])
     assert len(document["rows"]) == 8
-    assert {each: each.stat().st_mtime_ns for each in finished.glob("runs/*.json")} == before
+    assert {path: path.stat().st_mtime_ns for path in finished.glob("runs/*.json")} == before
     code, output, errors = call("experiment", file, "--out", finished)
     assert "TCMRL" in output and "0 runs done, 4 already present" in output
 
@@ -168,7 +168,7 @@ def test_one_folder_never_holds_two_settings_of_a_method(
     assert_refused(
         call("experiment", file, "--out", finished, "--seeds", "7", "--only", "TCMRL"), "log_every 20"
     )
-    assert {each.stem for each in finished.glob("runs/*.json")} == FILES
+    assert {path.stem for path in finished.glob("runs/*.json")} == FILES
 
 
 def test_only_and_seeds_choose_runs_and_the_table_keeps_the_rest(
@@ -258,7 +258,7 @@ def test_every_shipped_experiment_resolves_on_the_recipes_of_its_environments(na
             resolve_method(experiment, table, environment=environment, label=label, place=name)
             for label in experiment.methods
         ]
-        assert len({each.model_dump_json() for each in configs}) == len(configs)  # no two are the same
+        assert len({config.model_dump_json() for config in configs}) == len(configs)  # no two are the same
 
 
 def test_a_methods_changes_go_over_the_environments_over_the_experiments(tiny_folder: Path) -> None:
@@ -336,7 +336,7 @@ def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
     dataset = tcmrl_data.open_dataset(tiny_folder)
     straight = train_run(dataset, tmp_path / "straight", config=resumed.config, profile="quick", seed=1)
     assert resumed.digest == straight.digest
-    assert [each.step for each in resumed.curve] == [20, 40]
+    assert [point.step for point in resumed.curve] == [20, 40]
 
 
 def test_a_missing_experiment_attribute_is_named() -> None:

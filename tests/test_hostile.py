@@ -74,7 +74,7 @@ def look(folder: Path) -> tuple[str, str]:
 
 def files_of(folder: Path) -> dict[str, tuple[int, int, int]]:
     status = {str(path): path.lstat() for path in [folder, *folder.rglob("*")]}
-    return {path: (each.st_mode, each.st_size, each.st_mtime_ns) for path, each in status.items()}
+    return {path: (entry.st_mode, entry.st_size, entry.st_mtime_ns) for path, entry in status.items()}
 
 
 def resident_bytes(field: str) -> int:
@@ -136,13 +136,13 @@ def test_a_hostile_dataset_is_refused(forge: Forge, case: Case, capsys: pytest.C
     if stage != "verify":
         assert case.file in message
         assert case.words in message
-    named = [each for each in findings if case.file in each.file and case.words in each.problem]
+    named = [finding for finding in findings if case.file in finding.file and case.words in finding.problem]
     assert named, findings
     assert codes[0] == (2 if stage == "open" else 0)
     assert codes[1] == 0 if stage == "verify" else codes[1] in (0, 2)
     assert codes[2] in (0, 1)
     assert "Traceback" not in printed.err
-    assert all(each.isprintable() for each in (printed.out + printed.err).replace("\n", ""))
+    assert all(character.isprintable() for character in (printed.out + printed.err).replace("\n", ""))
 
 
 WRITERS: dict[str, Callable[[Path], object]] = {

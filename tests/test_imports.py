@@ -59,7 +59,7 @@ def test_looking_at_data_loads_nothing_heavy(arguments: list[str], tiny_folder: 
         "from tcmrl_cli.frame import run\n"
         "assert run(data, sys.argv[1:]) == 0\n"
     )
-    assert loaded_after(code, *(places.get(each, each) for each in arguments)) == set()
+    assert loaded_after(code, *(places.get(argument, argument) for argument in arguments)) == set()
 
 
 def test_a_plot_loads_matplotlib_and_no_window(tiny_folder: Path, tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_roots_load_nothing_until_asked_and_keep_what_they_promise(package: obje
     name = package.__name__  # type: ignore[attr-defined]
     assert loaded_after(f"import {name}") == set()
     root = importlib.import_module(name)
-    assert all(getattr(root, each) is not None for each in root.__all__)
+    assert all(getattr(root, name) is not None for name in root.__all__)
     assert set(root.__all__) <= set(dir(root))
     with pytest.raises(AttributeError, match="attribute nothing"):
         _ = root.nothing

@@ -94,10 +94,10 @@ def test_hdf5_flat_arrays_are_the_transitions(tiny: Dataset, exported: Path) -> 
     episodes = tiny.select(tasks=[40]).trajectories(40)
     with h5py.File(exported / "task_00040.hdf5") as file:
         np.testing.assert_array_equal(
-            file["observations"][:], np.concatenate([each.observations[:-1] for each in episodes])
+            file["observations"][:], np.concatenate([episode.observations[:-1] for episode in episodes])
         )
         np.testing.assert_array_equal(
-            file["next_observations"][:], np.concatenate([each.observations[1:] for each in episodes])
+            file["next_observations"][:], np.concatenate([episode.observations[1:] for episode in episodes])
         )
         for flat, name in {
             "actions": "actions",

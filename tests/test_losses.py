@@ -168,7 +168,7 @@ def test_task_contrastive_loss_by_hand() -> None:
     for t in range(2):
         for own, prior in enumerate((first[t], second[t])):
             logits = [2.0 * prior * target for target in (first[t + 1], second[t + 1])]
-            terms.append(logits[own] - math.log(sum(math.exp(each) for each in logits)))
+            terms.append(logits[own] - math.log(sum(math.exp(logit) for logit in logits)))
     assert loss.item() == pytest.approx(-sum(terms) / 4, rel=1e-6)
 
 

@@ -42,7 +42,7 @@ def test_attention_follows_equations_2_to_5(hidden: tuple[int, ...]) -> None:
     representations, network = random(1, 3, 4), extractor(hidden)
     attention = network(representations, torch.ones(1, 3, dtype=torch.bool))
     mean = representations[0].mean(dim=0)
-    scores = torch.stack([network.perceptron(torch.cat([each, mean])) for each in representations[0]])
+    scores = torch.stack([network.perceptron(torch.cat([row, mean])) for row in representations[0]])
     weights = torch.softmax(scores.flatten(), dim=0)
     torch.testing.assert_close(attention.weights[0], weights)
     torch.testing.assert_close(attention.context[0], weights @ representations[0])
@@ -126,10 +126,10 @@ def test_hidden_layers_in_bfloat16_round_and_leave_parameters_and_outputs_in_flo
     assert not torch.equal(rounded, exact)
     torch.testing.assert_close(rounded, exact, atol=0.02, rtol=0.02)
     rounded.sum().backward()
-    for each in (inputs, *network.parameters()):
-        assert each.grad is not None
-        assert each.grad.dtype == torch.float32
-        assert each.grad.abs().sum() > 0
+    for tensor in (inputs, *network.parameters()):
+        assert tensor.grad is not None
+        assert tensor.grad.dtype == torch.float32
+        assert tensor.grad.abs().sum() > 0
 
 
 def test_starts_depend_on_the_generator_alone() -> None:

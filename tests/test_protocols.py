@@ -20,7 +20,7 @@ def two_tests(tiny: Dataset) -> Dataset:
     """The tiny dataset with a second test task."""
     manifest = tiny.manifest
     moved = [
-        each.model_copy(update={"split": "test"}) if each.index == 40 else each for each in manifest.tasks
+        task.model_copy(update={"split": "test"}) if task.index == 40 else task for task in manifest.tasks
     ]
     return Dataset(tiny.folder, manifest.model_copy(update={"tasks": tuple(moved)}))
 
@@ -51,20 +51,21 @@ def test_offline_protocol_draws_stored_trajectories_of_the_task_itself(two_tests
     adaptations = PROTOCOLS.get("offline")().adapt(place, two_tests.test_tasks)
     for task, adaptation in zip(two_tests.test_tasks, adaptations, strict=True):
         stored = {
-            each.rewards.tobytes() for each in two_tests.select(tasks=[task.index]).trajectories(task.index)
+            trajectory.rewards.tobytes()
+            for trajectory in two_tests.select(tasks=[task.index]).trajectories(task.index)
         }
-        drawn = [[each.rewards.tobytes() for each in context] for context in adaptation.contexts]
-        assert [len(set(each)) for each in drawn] == [2, 2, 2]
-        assert all(set(each) <= stored for each in drawn)
-        assert len({tuple(each) for each in drawn}) > 1
+        drawn = [[trajectory.rewards.tobytes() for trajectory in context] for context in adaptation.contexts]
+        assert [len(set(context)) for context in drawn] == [2, 2, 2]
+        assert all(set(context) <= stored for context in drawn)
+        assert len({tuple(context) for context in drawn}) > 1
 
 
 def test_stored_contexts_come_from_the_snapshots_of_contexts(two_tests: Dataset) -> None:
     (task, *_) = two_tests.test_tasks
     place = arena(two_tests, GoalReader(), context_snapshots="last", offline_trajectories=6)
     last = two_tests.select(tasks=[task.index], snapshots="last").trajectories(task.index)
-    stored = {each.rewards.tobytes() for each in place.stored(task, draw=0)}
-    assert stored == {each.rewards.tobytes() for each in last}
+    stored = {trajectory.rewards.tobytes() for trajectory in place.stored(task, draw=0)}
+    assert stored == {trajectory.rewards.tobytes() for trajectory in last}
 
 
 def test_idaq_protocol_tries_training_contexts_and_keeps_the_best(two_tests: Dataset) -> None:
@@ -118,7 +119,7 @@ def test_a_context_that_two_tasks_keep_is_not_another_tasks(two_tests: Dataset) 
     shared = place.stored(two_tests.train_tasks[0], draw=0)
     own = {task.index: [shared] for task in tests}
     (borrowed,) = contexts_of_others(place, tests[0], own)[:1]
-    assert all(each is not mine for each in borrowed for mine in shared)
+    assert all(trajectory is not mine for trajectory in borrowed for mine in shared)
 
 
 def test_contexts_of_others_are_never_the_tasks_own(two_tests: Dataset, tiny: Dataset) -> None:
@@ -130,8 +131,11 @@ def test_contexts_of_others_are_never_the_tasks_own(two_tests: Dataset, tiny: Da
     (task,) = tiny.test_tasks
     borrowed = contexts_of_others(lone, task, {task.index: [lone.stored(task, draw=0)]})
     assert len(borrowed) == 3
-    stored = {each.rewards.tobytes() for each in tiny.select(tasks=[task.index]).trajectories(task.index)}
-    assert not stored & {each.rewards.tobytes() for context in borrowed for each in context}
+    stored = {
+        trajectory.rewards.tobytes()
+        for trajectory in tiny.select(tasks=[task.index]).trajectories(task.index)
+    }
+    assert not stored & {trajectory.rewards.tobytes() for context in borrowed for trajectory in context}
 
 
 def test_lanes_beyond_one_batch_keep_their_order(two_tests: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -139,7 +143,7 @@ def test_lanes_beyond_one_batch_keep_their_order(two_tests: Dataset, monkeypatch
         place = arena(two_tests, GoalReader())
         tasks = [*two_tests.tasks]
         contexts = [place.stored(task, draw=0) for task in tasks]
-        return [each.undiscounted_return for each in place.adapted(tasks, contexts, episode=0)]
+        return [trajectory.undiscounted_return for trajectory in place.adapted(tasks, contexts, episode=0)]
 
     whole = returns()
     monkeypatch.setattr("tcmrl_algo.adaptation.arena.MOST_LANES", 2)

@@ -164,13 +164,13 @@ def test_every_sync_is_needed(tiny: Dataset, memory: Path, log: tuple[Path, list
         name = operation[1].relative_to(root).as_posix()
         return re.sub(r"[0-9a-f]{32}|(?<=step_)\d+", "#", name) if operation[0] == "sync" else None
 
-    kinds = sorted({each for each in map(kind, operations) if each})
-    for each in kinds:
-        without = [operation for operation in operations if kind(operation) != each]
+    kinds = sorted({label for label in map(kind, operations) if label})
+    for label in kinds:
+        without = [operation for operation in operations if kind(operation) != label]
         last = f"after operation {len(without) - 1},"
         states = states_after_power_cuts(root, without, memory, stride=15)
         flaws = [found for place, out in states if (found := flaw(out, finished=last in place, tiny=tiny))]
-        assert flaws, f"syncs of {each} could be left out"
+        assert flaws, f"syncs of {label} could be left out"
     figures(f"syncs of {len(kinds)} kinds of files and folders left out one by one, each found")
 
 

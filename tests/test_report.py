@@ -109,7 +109,7 @@ def test_a_verdict_follows_from_paired_differences(
 
 def test_differences_are_paired_by_seed_and_large_common_noise_cancels(trained: FinishedRun) -> None:
     noise = [-100.0, 50.0, 3.0, 77.0, -20.0]
-    better = _with_finals(trained, "A", [each + 1.0 for each in noise])
+    better = _with_finals(trained, "A", [value + 1.0 for value in noise])
     worse = _with_finals(trained, "B", noise)
     found = _judge(Claim(text="", better="A", worse="B"), [*better, *worse[::-1]])
     assert (found.verdict, found.low, found.high) == ("supported", 1.0, 1.0)
@@ -229,24 +229,24 @@ def test_a_report_holds_every_section_and_every_file_it_names(report: WrittenRep
     for heading in ("Claims", "Learning curves", "Time and memory", "Contexts", "Attention"):
         assert f"# {heading}" in text
     assert set(re.findall(r"\]\((.+?\.png)\)", text)) == {
-        each.name for each in report.files if each.suffix == ".png"
+        file.name for file in report.files if file.suffix == ".png"
     }
-    assert {each.name for each in report.report.parent.iterdir()} == {each.name for each in report.files}
+    assert {file.name for file in report.report.parent.iterdir()} == {file.name for file in report.files}
     for file in report.files:
         assert file.stat().st_size > 0
         if file.suffix == ".png":
             assert file.read_bytes().startswith(PNG)
     result = read_record(RunResult, results / "runs/point-robot--tcmrl--seed0.json")
     assert result.root in text
-    (digests,) = (each for each in report.files if each.name.endswith("-digests.csv"))
+    (digests,) = (file for file in report.files if file.name.endswith("-digests.csv"))
     assert digests.name in text and result.digest in digests.read_text()
     table = final_table("x", [result])
     assert f"{table.rows[0][3]:.4g}" in text
-    assert [each.verdict for each in report.verdicts] == ["cannot tell"] * 2
+    assert [verdict.verdict for verdict in report.verdicts] == ["cannot tell"] * 2
 
 
 def test_dataset_returns_are_those_of_its_parts(report: WrittenReport, tiny: Dataset) -> None:
-    (file,) = (each for each in report.files if each.name.endswith("-dataset.csv"))
+    (file,) = (path for path in report.files if path.name.endswith("-dataset.csv"))
     rows = {row["snapshot"]: row for row in csv.DictReader(file.read_text().splitlines())}
     means = [tiny.part(task.index, 150).statistics.mean for task in tiny.train_tasks]
     assert float(rows["150"]["training tasks"]) == pytest.approx(np.mean(means))
@@ -278,8 +278,8 @@ def copy(results: Path, tmp_path: Path) -> Path:
 def test_claims_of_several_experiments_stand_together_first(copy: Path, tmp_path: Path) -> None:
     written = write_report([copy, copy], tmp_path / "both")
     rows = list(csv.DictReader((tmp_path / "both/claims.csv").read_text().splitlines()))
-    assert [each["claim"] for each in rows] == [each.claim for each in written.verdicts]
-    assert {each["experiment"] for each in rows} == {"small", "small-1"}
+    assert [row["claim"] for row in rows] == [verdict.claim for verdict in written.verdicts]
+    assert {row["experiment"] for row in rows} == {"small", "small-1"}
     headings = re.findall(r"^## (.+)$", written.report.read_text(), re.MULTILINE)
     assert headings[0] == "All claims" and len(headings) == 3
 
@@ -300,7 +300,10 @@ def test_a_report_names_the_runs_that_are_missing_and_why(copy: Path) -> None:
     report = write_report([copy], copy / "report")
     text = report.report.read_text()
     assert f"1 of its runs, `{lost.name}` (loss/critic is not finite at step 7)" in text
-    assert [each.seeds for each in report.verdicts] == [(), ()]  # no run to compare, no checkpoint to look at
+    assert [verdict.seeds for verdict in report.verdicts] == [
+        (),
+        (),
+    ]  # no run to compare, no checkpoint to look at
 
 
 def test_what_is_no_run_is_refused(results: Path, tmp_path: Path, call: Call) -> None:

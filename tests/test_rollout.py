@@ -75,11 +75,11 @@ def environment() -> Environment:
 def test_episodes_end_where_they_end(environment: Environment) -> None:
     lanes, controller = Falling(), Recording()
     episodes = roll(environment, lanes, controller)
-    assert [len(each) for each in episodes] == [1, 2, 3, 4, 4, 4]
-    assert [bool(each.terminated[-1]) for each in episodes] == [True] * 4 + [False] * 2
-    assert [bool(each.truncated[-1]) for each in episodes] == [False] * 4 + [True] * 2
-    assert [each.observations[-1, 0] for each in episodes] == [1, 2, 3, 4, 4, 4]
-    assert [each.undiscounted_return for each in episodes] == [1, 2, 3, 4, 4, 4]
+    assert [len(episode) for episode in episodes] == [1, 2, 3, 4, 4, 4]
+    assert [bool(episode.terminated[-1]) for episode in episodes] == [True] * 4 + [False] * 2
+    assert [bool(episode.truncated[-1]) for episode in episodes] == [False] * 4 + [True] * 2
+    assert [episode.observations[-1, 0] for episode in episodes] == [1, 2, 3, 4, 4, 4]
+    assert [episode.undiscounted_return for episode in episodes] == [1, 2, 3, 4, 4, 4]
     assert lanes.stepped == [[0, 1, 2, 3, 4, 5], [1, 2, 3, 4, 5], [2, 3, 4, 5], [3, 4, 5]]
 
 
@@ -87,7 +87,7 @@ def test_the_controller_sees_every_lane_and_actions_are_stored_as_executed(envir
     controller = Recording()
     episodes = roll(environment, Falling(), controller)
     assert controller.seen == [6, 6, 6, 6]
-    assert all((each.actions == 1.0).all() for each in episodes)
+    assert all((episode.actions == 1.0).all() for episode in episodes)
 
 
 def test_the_controller_observes_every_step_as_it_was_executed(environment: Environment) -> None:

@@ -47,7 +47,7 @@ def sampler() -> Sampler:
 
 def leaves(batch: Batch) -> list[torch.Tensor]:
     steps = [batch[name] for name in batch.names()]
-    found = [getattr(each, field.name) for each in steps for field in dataclasses.fields(each)]
+    found = [getattr(part, field.name) for part in steps for field in dataclasses.fields(part)]
     return [batch.task_indices, *(tensor for tensor in found if tensor is not None)]
 
 
@@ -138,11 +138,11 @@ def test_a_million_draws_are_uniform(lengths: list[list[int]]) -> None:
     assert rows.sum() == 2 * 10**6
     assert chi_square(tasks) < 4
     first = 0
-    for task, each in enumerate(lengths):
-        stop = first + sum(steps + 1 for steps in each)
+    for task, task_lengths in enumerate(lengths):
+        stop = first + sum(steps + 1 for steps in task_lengths)
         for counts, steps in zip(rows[:, first:stop], (1, 4), strict=True):
             valid = counts[counts > 0]
-            assert len(valid) == sum(max(0, length - steps + 1) for length in each)
+            assert len(valid) == sum(max(0, length - steps + 1) for length in task_lengths)
             assert chi_square(valid) < 4
         assert chi_square(episodes[4 * task : 4 * task + 4]) < 4
         first = stop
@@ -155,8 +155,8 @@ def test_a_million_draws_are_uniform(lengths: list[list[int]]) -> None:
 @settings(deadline=None, max_examples=60)
 def test_every_length_around_k_is_served_as_stated(lengths: list[list[int]], n: int) -> None:
     """K = 4: episodes of 0, 1, K - 1, K and K + 1 steps."""
-    for each in lengths:
-        each += [1, 5]
+    for task_lengths in lengths:
+        task_lengths += [1, 5]
     request = BatchRequest(
         tasks=3,
         kinds={
@@ -167,10 +167,12 @@ def test_every_length_around_k_is_served_as_stated(lengths: list[list[int]], n: 
         },
     )
     sampler = sampler_of(numbered_tasks(lengths), request)
-    assert sampler.short_trajectories(4) == sum(0 < steps < 4 for each in lengths for steps in each)
+    assert sampler.short_trajectories(4) == sum(
+        0 < steps < 4 for task_lengths in lengths for steps in task_lengths
+    )
     batch = sampler.batch(n)
     for steps in (batch["policy"], batch["context"], batch["execution"], batch["windows"]):
-        task, episode, t = (each[steps.mask] for each in steps.observations.unbind(-1))
+        task, episode, t = (column[steps.mask] for column in steps.observations.unbind(-1))
         length = torch.tensor([lengths[int(b)][int(e)] for b, e in zip(task, episode, strict=True)])
         assert (t < length).all() and steps.mask.flatten(1).any(1).all()
         following = torch.stack([task, episode, t + 1], -1)
@@ -230,8 +232,8 @@ def test_resuming_at_n_gives_the_batches_of_an_uninterrupted_run(n: int) -> None
     straight, resumed = (sampler_of(numbered_tasks(LENGTHS), REQUEST) for _ in range(2))
     for earlier in range(max(0, n - 3), n):
         straight.batch(earlier)
-    for each in range(n, n + 2):
-        pairs = zip(leaves(straight.batch(each)), leaves(resumed.batch(each)), strict=True)
+    for index in range(n, n + 2):
+        pairs = zip(leaves(straight.batch(index)), leaves(resumed.batch(index)), strict=True)
         assert all(torch.equal(a, b) for a, b in pairs)
 
 
@@ -244,12 +246,12 @@ def test_moments_equal_those_of_the_flat_data(chunk_rows: int, episodes: list[li
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("tcmrl_data.sampling.moments.CHUNK_ROWS", chunk_rows)
         found = sampler_of(episodes, BatchRequest(tasks=2, kinds={})).moments()
-    flat = [each for task in episodes for each in task]
-    observations = np.concatenate([each.observations[:-1] for each in flat]).astype(np.float64)
-    deltas = np.concatenate([np.diff(each.observations, axis=0) for each in flat]).astype(np.float64)
+    flat = [episode for task in episodes for episode in task]
+    observations = np.concatenate([episode.observations[:-1] for episode in flat]).astype(np.float64)
+    deltas = np.concatenate([np.diff(episode.observations, axis=0) for episode in flat]).astype(np.float64)
     np.testing.assert_allclose(found.observation_mean, observations.mean(0), atol=1e-6)
     np.testing.assert_allclose(found.delta_std, np.maximum(deltas.std(0), 1e-6), atol=1e-5)
-    assert found.longest_episode == max(len(each) for each in flat)
+    assert found.longest_episode == max(len(episode) for episode in flat)
 
 
 def test_test_tasks_are_refused_for_training(tiny: Dataset) -> None:

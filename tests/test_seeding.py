@@ -25,7 +25,7 @@ def test_streams_differ_in_every_coordinate() -> None:
         (0, "point-robot", 1, Purpose.ROLLOUT_RESET, 3, 3),
         (0, "point-robot", 1, Purpose.ROLLOUT_RESET, 2, 4),
     ]
-    assert len({keyed_seed(*each) for each in [base, *others]}) == 7
+    assert len({keyed_seed(*coordinates) for coordinates in [base, *others]}) == 7
     assert keyed_seed(*base) == keyed_seed(*base)
 
 

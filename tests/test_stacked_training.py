@@ -78,11 +78,11 @@ def settings_of(recipe: Recipe) -> StackedSettings:
 
 
 def snapshots_of(recipe: Recipe, context: BehaviorContext) -> dict[tuple[int, int], Snapshot]:
-    return {(task.index, each.step): each for task, each in source_of(recipe).snapshots(context)}
+    return {(task.index, snapshot.step): snapshot for task, snapshot in source_of(recipe).snapshots(context)}
 
 
 def digests(snapshots: dict[tuple[int, int], Snapshot]) -> dict[tuple[int, int], str]:
-    return {key: each.digest() for key, each in snapshots.items()}
+    return {key: snapshot.digest() for key, snapshot in snapshots.items()}
 
 
 def ids(folder: Path) -> dict[tuple[int, int], str]:
@@ -133,7 +133,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
         context_of(recipe, tasks, tmp_path, seconds=0.0, stop_at=stop_at)
     )
     with pytest.raises(Interrupted):
-        resumed.update(((task.index, each.step), each.digest()) for task, each in interrupted)
+        resumed.update(((task.index, snapshot.step), snapshot.digest()) for task, snapshot in interrupted)
     context = context_of(recipe, tasks, tmp_path)
     state = context.checkpoints(context.tasks).load()
     assert state is not None
@@ -253,7 +253,9 @@ def test_a_diverged_agent_is_named_and_the_others_are_kept(tmp_path: Path) -> No
     recipe = recipe_of()
     found: dict[tuple[int, int], Snapshot] = {}
     context = context_of(recipe, [1, 2, 3], tmp_path)
-    pairs = (((task.index, each.step), each) for task, each in source_of(recipe).snapshots(context))
+    pairs = (
+        ((task.index, snapshot.step), snapshot) for task, snapshot in source_of(recipe).snapshots(context)
+    )
     with pytest.raises(BuildError, match=r"diverged: task 2 by step 130; use a smaller"):
         found.update(pairs)
     assert set(found) == {(1, 0), (2, 0), (3, 0), (1, 100), (2, 100), (3, 100), (1, 130), (3, 130)}

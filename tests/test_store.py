@@ -109,8 +109,8 @@ def test_xarray_opens_a_part_of_episodes_of_several_lengths(tmp_path: Path) -> N
     xarray = pytest.importorskip("xarray", reason="xarray is not installed; pip install xarray")
     flags = [np.zeros(length, dtype=bool) for length in (2, 3)]
     episodes = [
-        Trajectory(np.ones((len(each) + 1, 4)), np.ones((len(each), 2)), np.ones(len(each)), each, each)
-        for each in flags
+        Trajectory(np.ones((len(ended) + 1, 4)), np.ones((len(ended), 2)), np.ones(len(ended)), ended, ended)
+        for ended in flags
     ]
     write_tree(tmp_path / "part", encode_arrays(pack(episodes)))
     opened = xarray.open_zarr(tmp_path / "part", consolidated=False, zarr_format=3)

@@ -46,9 +46,9 @@ def terms_of(found: ContextLosses) -> set[str]:
 def scramble(values: Steps) -> Steps:
     """The same real steps with other padding."""
 
-    def other(each: Tensor) -> Tensor:
-        mask = values.mask.reshape(values.mask.shape + (1,) * (each.ndim - values.mask.ndim))
-        return torch.where(mask, each, each + 3.0)
+    def other(tensor: Tensor) -> Tensor:
+        mask = values.mask.reshape(values.mask.shape + (1,) * (tensor.ndim - values.mask.ndim))
+        return torch.where(mask, tensor, tensor + 3.0)
 
     return replace(
         values,
@@ -84,7 +84,10 @@ def test_negative_loss_leaves_the_estimator_untouched(sparse: bool) -> None:
     for parameter in made.estimator.parameters():
         assert parameter.grad is None or not parameter.grad.any()
     for part in (made.encoder, made.extractor):
-        assert max(each.grad.abs().max() for each in part.parameters() if each.grad is not None) > 1e-7
+        assert (
+            max(parameter.grad.abs().max() for parameter in part.parameters() if parameter.grad is not None)
+            > 1e-7
+        )
 
 
 def test_sparsity_and_contrastive_train_what_they_should() -> None:
@@ -100,20 +103,20 @@ def test_sparsity_and_contrastive_train_what_they_should() -> None:
 
 def test_actor_critic_losses_never_reach_the_context() -> None:
     made = method({"weights": ONLY})
-    before = {name: each.clone() for name, each in made.learner.state_dict().items()}
+    before = {name: value.clone() for name, value in made.learner.state_dict().items()}
     made.update(batch(), 1)
-    for name, each in made.learner.state_dict().items():
-        assert torch.equal(each, before[name]), name
+    for name, value in made.learner.state_dict().items():
+        assert torch.equal(value, before[name]), name
 
 
 def test_an_update_moves_everything_that_learns_w_included() -> None:
     made = method()
-    before = {name: each.detach().clone() for name, each in made.learner.named_parameters()}
+    before = {name: parameter.detach().clone() for name, parameter in made.learner.named_parameters()}
     torch.testing.assert_close(before["similarity"], torch.eye(4))
     metrics = made.update(batch(), 1)
-    assert all(torch.isfinite(each) for each in metrics.values())
-    for name, each in made.learner.named_parameters():
-        assert not torch.equal(each, before[name]), name
+    assert all(torch.isfinite(value) for value in metrics.values())
+    for name, parameter in made.learner.named_parameters():
+        assert not torch.equal(parameter, before[name]), name
 
 
 @pytest.mark.parametrize("sparse", [False, True])
@@ -157,8 +160,8 @@ def test_literal_equation_6_adds_nothing_to_any_gradient() -> None:
     total = losses_of(made).total
     total.backward()  # type: ignore[no-untyped-call]
     assert total.item() == pytest.approx(1.0)
-    grads = [each.grad for each in made.parameters() if each.grad is not None]
-    assert max(each.abs().max() for each in grads) < 1e-7
+    grads = [parameter.grad for parameter in made.parameters() if parameter.grad is not None]
+    assert max(grad.abs().max() for grad in grads) < 1e-7
 
 
 def test_sampled_windows_replace_those_of_the_context() -> None:
@@ -167,7 +170,7 @@ def test_sampled_windows_replace_those_of_the_context() -> None:
     drawn = [
         losses_of(made, with_steps(batch(), windows=steps(TASKS, 4, 2, seed=seed))).metrics for seed in (7, 8)
     ]
-    assert len({plain, *(each["loss/contrastive"].item() for each in drawn)}) == 3
+    assert len({plain, *(metrics["loss/contrastive"].item() for metrics in drawn)}) == 3
     assert drawn[0]["loss/distance"].item() == drawn[1]["loss/distance"].item()
 
 
@@ -198,12 +201,14 @@ def test_a_term_of_weight_zero_is_gone_and_the_others_stay(name: str) -> None:
         ({"temperature": 2.0}, {"loss/contrastive"}),
         ({"reward_estimation": "trajectory"}, {"loss/positive", "loss/negative"}),
     ],
-    ids=lambda each: "-".join(map(str, each.items() if isinstance(each, dict) else sorted(each))),
+    ids=lambda value: "-".join(map(str, value.items() if isinstance(value, dict) else sorted(value))),
 )
 def test_a_switch_changes_its_own_terms_and_nothing_else(change: dict[str, Any], changed: set[str]) -> None:
     first, second = losses_of(learner()), losses_of(learner(change))
     assert first.metrics.keys() == second.metrics.keys()
-    different = {name for name, each in first.metrics.items() if not torch.equal(each, second.metrics[name])}
+    different = {
+        name for name, value in first.metrics.items() if not torch.equal(value, second.metrics[name])
+    }
     assert different == changed
     torch.testing.assert_close(first.context, second.context)
 
@@ -221,7 +226,7 @@ def test_k_is_the_length_of_the_windows(window_length: int) -> None:
     found = losses_of(changed).metrics
     torch.testing.assert_close(found["loss/contrastive"], expected)
     first = losses_of(learner()).metrics
-    different = {name for name, each in first.items() if not torch.equal(each, found[name])}
+    different = {name for name, value in first.items() if not torch.equal(value, found[name])}
     assert different == ({"loss/contrastive"} if window_length != 2 else set())
 
 
@@ -256,14 +261,14 @@ def test_without_the_extractor_the_context_is_the_mean() -> None:
     with_it = losses_of(learner())
     torch.testing.assert_close(found.metrics["loss/contrastive"], with_it.metrics["loss/contrastive"])
     found.total.backward()  # type: ignore[no-untyped-call]
-    assert all(each.grad is None for each in made.extractor.parameters())
+    assert all(parameter.grad is None for parameter in made.extractor.parameters())
 
 
 def test_switches_of_the_context_leave_the_actor_critics_draws_alone() -> None:
     weights: dict[str, float] = ONLY
     first, second = method({"weights": weights}), method({"weights": weights, "extractor": "mean"})
-    for name, each in first.actor_critic.state_dict().items():
-        assert torch.equal(each, second.actor_critic.state_dict()[name]), name
+    for name, value in first.actor_critic.state_dict().items():
+        assert torch.equal(value, second.actor_critic.state_dict()[name]), name
     noisy = method({"weights": weights | {"negative": 1e-30}})
     expected = first.update(batch(), 1)["loss/policy"]
     torch.testing.assert_close(noisy.update(batch(), 1)["loss/policy"], expected, rtol=0, atol=0)

@@ -135,7 +135,7 @@ def test_resuming_at_50_gives_the_same_parameters_at_100(start: Train, tiny: Dat
     resumed = resume_run(half.run.folder, tiny, steps=100)
     assert resumed.digest == straight.digest
     assert open_run(half.run.folder).newest().step == 100
-    lines = [_metrics(each.run.folder) for each in (straight, half)]
+    lines = [_metrics(report.run.folder) for report in (straight, half)]
     assert lines[0] == lines[1]
 
 
@@ -162,7 +162,7 @@ def test_a_run_killed_between_checkpoints_resumes_from_the_last(
 
 def _metrics(folder: Path) -> list[dict[str, float]]:
     lines = [json.loads(line) for line in (folder / "metrics.jsonl").read_text().splitlines()]
-    return [{name: each for name, each in line.items() if not name.startswith("time/")} for line in lines]
+    return [{name: value for name, value in line.items() if not name.startswith("time/")} for line in lines]
 
 
 def test_a_run_records_what_it_is_a_function_of(start: Train, tiny: Dataset) -> None:
@@ -194,8 +194,8 @@ def test_only_the_newest_checkpoints_stay(start: Train, tiny: Dataset) -> None:
     found = run.checkpoints()
     assert len(list((run.folder / "checkpoints").iterdir())) == 2
     assert list((run.folder / ".staging").iterdir()) == []
-    assert [each.step for each in found] == [75, 80]
-    assert sorted(each.name for each in found[0].folder.iterdir()) == [
+    assert [checkpoint.step for checkpoint in found] == [75, 80]
+    assert sorted(path.name for path in found[0].folder.iterdir()) == [
         "checkpoint.json",
         "tensors.safetensors",
     ]
@@ -247,7 +247,7 @@ def test_what_cannot_start_leaves_nothing(start: Train, tmp_path: Path) -> None:
 
 def test_fewer_than_two_training_tasks_are_refused(tiny: Dataset, tmp_path: Path) -> None:
     train, test = tiny.train_tasks[0], tiny.test_tasks[0]
-    kept = [each for each in tiny.manifest.tasks if each.index in (train.index, test.index)]
+    kept = [task for task in tiny.manifest.tasks if task.index in (train.index, test.index)]
     lone = Dataset(tiny.folder, tiny.manifest.model_copy(update={"tasks": tuple(kept)}))
     with pytest.raises(SelectionError, match="at least 2 training tasks"):
         train_run(lone, tmp_path / "run", config=config_of(tiny), profile="quick")
@@ -255,7 +255,7 @@ def test_fewer_than_two_training_tasks_are_refused(tiny: Dataset, tmp_path: Path
 
 def test_two_training_tasks_suffice(tiny: Dataset, tmp_path: Path) -> None:
     chosen = {task.index for task in (*tiny.train_tasks[:2], *tiny.test_tasks)}
-    kept = [each for each in tiny.manifest.tasks if each.index in chosen]
+    kept = [task for task in tiny.manifest.tasks if task.index in chosen]
     pair = Dataset(tiny.folder, tiny.manifest.model_copy(update={"tasks": tuple(kept)}))
     report = train_run(pair, tmp_path / "run", config=config_of(tiny), profile="quick", steps=5)
     assert report.step == 5
@@ -276,7 +276,7 @@ def test_an_exploding_q_stops_with_its_name_and_step_and_keeps_the_last_checkpoi
         start("run", *wild, *rates, steps=400)
     step = int(str(caught.value).partition("at step ")[2].partition(";")[0])
     assert open_run(tmp_path / "run").newest().step == step - 1  # the last one before
-    assert all(each.isfinite().all() for each in open_run(tmp_path / "run").newest().tensors().values())
+    assert all(tensor.isfinite().all() for tensor in open_run(tmp_path / "run").newest().tensors().values())
 
 
 def test_contexts_may_come_from_other_snapshots_than_transitions(start: Train, tiny: Dataset) -> None:
@@ -297,8 +297,8 @@ def test_contexts_may_come_from_other_snapshots_than_transitions(start: Train, t
 def test_progress_is_reported_with_rates(start: Train) -> None:
     seen: list[TrainingProgress] = []
     start("run", steps=25, report=seen.append)
-    assert [(each.step, each.steps) for each in seen] == [(10, 25), (20, 25), (25, 25)]
-    assert all(each.rate > 0 and 0 <= each.data_share <= 1 for each in seen)
+    assert [(progress.step, progress.steps) for progress in seen] == [(10, 25), (20, 25), (25, 25)]
+    assert all(progress.rate > 0 and 0 <= progress.data_share <= 1 for progress in seen)
 
 
 def test_the_memory_limit_changes_where_data_are_and_no_result(

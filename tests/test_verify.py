@@ -150,7 +150,7 @@ def test_levels_look_ever_closer(forge: Forge) -> None:
     file = forge.part / "rewards/c/0"
     file.write_bytes(file.read_bytes()[:-1] + bytes([file.read_bytes()[-1] ^ 1]))
     assert verify_dataset(forge.folder, level="quick").findings == ()
-    assert [each.file for each in verify_dataset(forge.folder).findings] == [f"{PART}/rewards/c/0"]
+    assert [finding.file for finding in verify_dataset(forge.folder).findings] == [f"{PART}/rewards/c/0"]
     forge.write("rewards/c/0", file.read_bytes())
     assert verify_dataset(forge.folder).findings == ()
     (finding,) = verify_dataset(forge.folder, level="deep").findings
@@ -186,7 +186,9 @@ def test_a_deep_look_finds_values_that_cannot_be(
 ) -> None:
     reencoded(forge, name, lambda array: array.__setitem__(row, value))
     findings = verify_dataset(forge.folder, level="deep").findings
-    assert any(problem in each.problem and (each.task, each.step) == (0, STEP) for each in findings), findings
+    assert any(
+        problem in finding.problem and (finding.task, finding.step) == (0, STEP) for finding in findings
+    ), findings
     assert verify_dataset(forge.folder).findings == ()
 
 
@@ -194,18 +196,18 @@ def test_a_replay_makes_the_same_bits_and_notices_others(
     forge: Forge, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     report = verify_dataset(forge.folder, replay=5)
-    assert [(each.task, each.exact, each.problems) for each in report.replays] == [
+    assert [(replay.task, replay.exact, replay.problems) for replay in report.replays] == [
         (0, True, ()),
         (3, True, ()),
     ]
     reencoded(forge, "actions", lambda array: array.__setitem__((7, 0), array[7, 0] + 1e-6))
     report = verify_dataset(forge.folder, replay=1)
-    assert [each.problem for each in report.findings] == ["replay: actions differs in 1 of 120 rows"]
+    assert [finding.problem for finding in report.findings] == ["replay: actions differs in 1 of 120 rows"]
 
     here = replay_module.provenance(open_dataset(forge.folder).environment, {})
     monkeypatch.setattr(replay_module, "provenance", lambda environment, behavior: here | {"cpu": "another"})
     report = verify_dataset(forge.folder, replay=1)
-    assert [(each.exact, each.problems) for each in report.replays] == [(False, ())]
+    assert [(replay.exact, replay.problems) for replay in report.replays] == [(False, ())]
     reencoded(forge, "actions", lambda array: array.__setitem__(slice(None), np.clip(array + 0.1, -1, 1)))
     problems = verify_dataset(forge.folder, replay=1).replays[0].problems
     assert "actions differ at step 0" in problems[0]
@@ -262,7 +264,7 @@ def test_repair_makes_exactly_the_rejected_parts_again(tiny_copy: Copy, tiny_fol
     report = repair_dataset(folder, workers=2)
     assert report.repaired == ((0, 100), (3, 0))
     assert report.groups == ("tasks/00060/snapshots/zarr.json",)
-    assert [(each.file, each.foreign) for each in report.left] == [("tasks/notes.txt", True)]
+    assert [(entry.file, entry.foreign) for entry in report.left] == [("tasks/notes.txt", True)]
     assert parts_of(folder) == parts_of(tiny_folder)
     assert read_manifest(folder).root == read_manifest(tiny_folder).root
     for key, before in records.items():
@@ -279,7 +281,7 @@ def test_repair_takes_links_away_without_following_them(forge: Forge) -> None:
     (forge.folder / "tasks/00000").symlink_to(forge.outside / "moved")
     before = sorted(forge.outside.rglob("*"))
     linked = verify_dataset(forge.folder).findings
-    assert "tasks/00000" in {each.file for each in linked}
+    assert "tasks/00000" in {finding.file for finding in linked}
     forge.manifest(lambda values: values["recipe"]["behavior"]["settings"].update(snapshots=[0, 100, 150]))
     report = repair_dataset(forge.folder, workers=1)
     assert report.repaired == ((0, STEP),)
@@ -338,7 +340,9 @@ def test_gc_takes_what_is_dead_and_a_dry_run_only_says_so(tiny_copy: Copy) -> No
     before = {path: path.lstat().st_mtime_ns for path in folder.rglob("*")}
     dry = collect_garbage(folder, dry_run=True)
     assert {path: path.lstat().st_mtime_ns for path in folder.rglob("*")} == before
-    assert {each.path: each.bytes for each in dry} == dict(zip(sorted(expected), (7, 1, 5), strict=True))
+    assert {removed.path: removed.bytes for removed in dry} == dict(
+        zip(sorted(expected), (7, 1, 5), strict=True)
+    )
     assert collect_garbage(folder) == dry
     assert list((folder / STAGING).iterdir()) == []
     assert [path.name for path in (folder / CHECKPOINTS).iterdir()] == ["task_00007"]
@@ -362,7 +366,9 @@ def test_gc_spares_a_live_attempt_and_is_refused_during_a_build(tiny_copy: Copy)
                     with pytest.raises(LockedError, match=f"process {process.pid}"):
                         collect_garbage(folder, dry_run=dry_run)
             else:
-                assert f"{STAGING}/{attempt.name}" not in {each.path for each in collect_garbage(folder)}
+                assert f"{STAGING}/{attempt.name}" not in {
+                    removed.path for removed in collect_garbage(folder)
+                }
                 assert (attempt / "x").exists()
             process.communicate(b"")
 
