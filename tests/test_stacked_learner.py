@@ -1,6 +1,7 @@
 """The stacked update against autograd and against Stable-Baselines3."""
 
 import math
+from collections.abc import Iterator
 
 import gymnasium
 import numpy as np
@@ -26,6 +27,15 @@ OBSERVATION_DIM, ACTION_DIM, BATCH = 5, 3, 32
 SETTINGS = Hyperparameters(
     hidden=(24, 16), learning_rate=1e-3, batch_size=BATCH, gamma=0.95, tau=0.02, entropy=None
 )
+
+
+@pytest.fixture(autouse=True, scope="module")
+def one_torch_thread() -> Iterator[None]:
+    """One torch thread, as in a worker: reductions split by thread round differently."""
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(threads)
 
 
 def learner(num_agents: int, settings: Hyperparameters = SETTINGS, device: torch.device = CPU) -> StackedSac:
@@ -154,7 +164,7 @@ def stacked_layers(made: StackedSac, agent: int) -> dict[str, list[Tensor]]:
     for name, stack in (("critic", made.critics), ("critic_target", made.targets)):
         places |= {f"{name}.{k}": (stack, k * made.num_agents + agent) for k in range(2)}
     return {
-        name: [each for layer in stack.layers for each in (layer.weight[index], layer.bias[index, 0])]
+        name: [tensor for layer in stack.layers for tensor in (layer.weight[index], layer.bias[index, 0])]
         for name, (stack, index) in places.items()
     }
 
@@ -254,7 +264,7 @@ def test_a_device_computes_the_same() -> None:
     for number in range(20):
         batch, noise = draws([0, 1, 2], number)
         on_cpu.update(batch, noise)
-        on_device.update(ReplayBatch(*(each.cuda() for each in vars(batch).values())), noise.cuda())
+        on_device.update(ReplayBatch(*(tensor.cuda() for tensor in vars(batch).values())), noise.cuda())
     torch.testing.assert_close(on_device.actors.parameters.cpu(), on_cpu.actors.parameters, rtol=0, atol=1e-4)
 
 
