@@ -221,7 +221,7 @@ def check_part(folder: Path) -> PartRecord:
         StoreError: names the file that is missing, changed or added.
     """
     record = read_part_record(folder / "part.json")
-    check_layout(folder, {name: each.model_dump() for name, each in record.identity.arrays.items()})
+    check_layout(folder, {name: array.model_dump() for name, array in record.identity.arrays.items()})
     for name, expected in record.files.items():
         file = folder / name
         if not file.is_file() or file.is_symlink() or sha256(file.read_bytes()) != expected.sha256:

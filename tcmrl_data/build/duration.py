@@ -80,7 +80,7 @@ def estimate_duration(plan: BuildPlan, workers: int) -> Duration:
 def task_seconds(
     source: BehaviorSource, found: Sequence[Measurement], *, update: float, stretch: float
 ) -> float:
-    """Seconds of one task: warm-up, updates and parts, each times its number.
+    """Seconds of one task: warm-up, updates and parts, multiplied by their numbers.
 
     Args:
         source: says how many of them there are.

@@ -164,11 +164,11 @@ def _lines(path: Path) -> Iterator[bytes]:
 
 
 def _is_well_typed(event: dict[str, Any]) -> bool:
-    """The record may be a stranger's: texts are texts, and numbers are finite and no flags."""
+    """True if texts are str and numbers are bounded int or float, not bool; the file may be damaged."""
     texts = [event["kind"], event["message"], event["unit"] or ""]
     numbers = [value for name, value in event.items() if name not in ("kind", "message", "unit")]
-    return all(isinstance(each, str) for each in texts) and all(
-        type(each) in (int, float) and abs(each) < 2**63 for each in numbers
+    return all(isinstance(text, str) for text in texts) and all(
+        type(number) in (int, float) and abs(number) < 2**63 for number in numbers
     )
 
 

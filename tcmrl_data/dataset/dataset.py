@@ -1,4 +1,4 @@
-"""Reading: `open_dataset` → `Dataset`; parts are loaded only when asked for."""
+"""Reading: `open_dataset` → `Dataset`; parts are loaded on first use."""
 
 import functools
 from collections.abc import Sequence
@@ -74,7 +74,7 @@ class Dataset:
 
     def __init__(self, folder: Path, manifest: Manifest) -> None:
         self.folder, self.manifest = folder, manifest
-        self.tasks = tuple(Task(each.index, each.split, each.parameters) for each in manifest.tasks)
+        self.tasks = tuple(Task(task.index, task.split, task.parameters) for task in manifest.tasks)
         self._entries = {(entry.task, entry.step): entry for entry in manifest.parts}
         self._records: dict[tuple[int, int], PartRecord] = {}
 

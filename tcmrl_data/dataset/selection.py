@@ -63,4 +63,6 @@ class Selection:
 
     def trajectories(self, task: int) -> list[Trajectory]:
         """All selected episodes of a task, snapshot by snapshot."""
-        return [each for step in self.steps[task] for each in self.dataset.trajectories(task, step)]
+        return [
+            trajectory for step in self.steps[task] for trajectory in self.dataset.trajectories(task, step)
+        ]

@@ -34,7 +34,7 @@ from tcmrl_data.sampling.rows import (
     PackedRows,
     PartRows,
     Table,
-    each_part,
+    map_parts,
     plan_rows,
     read_part,
     selection_rows,
@@ -198,6 +198,6 @@ def _write_rows(file: Path, plan: Sequence[PartRows], shape: tuple[int, int]) ->
                 remaining, offset = remaining[written:], offset + written
             return lengths
 
-        lengths = list(each_part(plan, write))
+        lengths = list(map_parts(plan, write))
     disk.sync(file)
     return lengths

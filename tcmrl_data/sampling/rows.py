@@ -1,6 +1,5 @@
 """Packed rows: all selected steps in one float32 table."""
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -11,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.store.arrays import Arrays, checked_offsets, read_arrays
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def read_rows(selection: "Selection") -> PackedRows:
     """
     plan = plan_rows(selection)
     table: Table = np.zeros(table_shape(selection, plan), dtype=np.float32)
-    lengths = list(each_part(plan, lambda part: read_part(part, table[part.first : part.last])))
+    lengths = list(map_parts(plan, lambda part: read_part(part, table[part.first : part.last])))
     return selection_rows(selection, table, Episodes.of(lengths, [part.task for part in plan]))
 
 
@@ -154,9 +154,9 @@ def selection_rows(selection: "Selection", table: Table, episodes: Episodes) -> 
     return PackedRows(table, episodes, environment.observation_dim, environment.action_dim, indices)
 
 
-def each_part(plan: Sequence[PartRows], read: Callable[[PartRows], Any]) -> Iterator[Any]:
+def map_parts(plan: Sequence[PartRows], read: Callable[[PartRows], Any]) -> Iterator[Any]:
     """Yields the results of `read` for all parts, in order; several threads read at the same time."""
-    with ThreadPoolExecutor(min(READERS, len(os.sched_getaffinity(0)))) as pool:
+    with ThreadPoolExecutor(min(READERS, available_cores())) as pool:
         yield from pool.map(read, plan)
 
 

@@ -32,13 +32,13 @@ def pack(trajectories: Sequence[Trajectory]) -> dict[str, npt.NDArray[Any]]:
     lengths = [len(trajectory) for trajectory in trajectories]
     floats = ("observations", "actions", "rewards")
     arrays: dict[str, npt.NDArray[Any]] = {
-        name: np.concatenate([getattr(each, name) for each in trajectories]).astype(
+        name: np.concatenate([getattr(trajectory, name) for trajectory in trajectories]).astype(
             np.float32 if name in floats else np.bool_
         )
         for name in ("observations", *STEP_ARRAYS)
     }
     for name in trajectories[0].extras:
-        arrays[name] = np.concatenate([each.extras[name] for each in trajectories])
+        arrays[name] = np.concatenate([trajectory.extras[name] for trajectory in trajectories])
     arrays["episode_offsets"] = np.concatenate([[0], np.cumsum(lengths)]).astype(np.int64)
     return arrays
 
@@ -117,7 +117,7 @@ def read_arrays(folder: Path, names: Iterable[str]) -> dict[str, npt.NDArray[Any
     """
     layouts = [read_layout(folder, name) for name in names]
     files = {layout.name: _read_files(folder, layout) for layout in layouts}
-    stored = sum(len(data) for each in files.values() for data in each.values())
+    stored = sum(len(data) for chunks in files.values() for data in chunks.values())
     check_expansion(layouts, stored, folder)
     return {layout.name: _decode(folder, layout, files.pop(layout.name)) for layout in layouts}
 

@@ -17,8 +17,10 @@ def check_files(folder: Path, record: PartRecord) -> list[ArrayLayout]:
     Raises:
         StoreError: names the file.
     """
-    layouts = check_layout(folder, {name: each.model_dump() for name, each in record.identity.arrays.items()})
-    check_expansion(layouts, sum(each.size for each in record.files.values()), folder)
+    layouts = check_layout(
+        folder, {name: array.model_dump() for name, array in record.identity.arrays.items()}
+    )
+    check_expansion(layouts, sum(file.size for file in record.files.values()), folder)
     unknown = unrecorded_file(record, layouts)
     if unknown:
         raise StoreError(f"{folder / 'part.json'}: files does not agree with the arrays on {unknown}")
@@ -40,7 +42,7 @@ def unrecorded_file(record: PartRecord, layouts: Sequence[ArrayLayout]) -> str |
 
 
 def file_mismatch(folder: Path, name: str, expected: FileRecord) -> str | None:
-    """Why a recorded file is not what it must be, its content aside; None where all is well."""
+    """Why a recorded file is not what it must be, its content aside; None where it is."""
     blocked = folder_problem(folder, os.path.dirname(name))
     if blocked:
         return f"cannot be reached: {blocked[0]} {blocked[1]}"
@@ -74,7 +76,7 @@ def layout_problems(folder: Path, record: PartRecord) -> Iterator[tuple[str, str
     if unknown:
         yield "part.json", f"files does not agree with the arrays on {unknown}"
     try:
-        check_expansion(layouts, sum(each.size for each in record.files.values()), folder)
+        check_expansion(layouts, sum(file.size for file in record.files.values()), folder)
     except StoreError as error:
         yield "", words_after(error, folder)
 

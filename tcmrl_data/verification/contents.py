@@ -21,14 +21,14 @@ from tcmrl_data.store.manifest import MAX_TASKS, STANDARD_ARRAYS, Manifest, Part
 from tcmrl_data.store.statistics import statistics
 
 ContentProblem = tuple[str, str]
-"""File or array within the part, and what is wrong with it."""
+"""File or array within the part, and its problem."""
 
 CLOSE = 1e-9
 """Relative tolerance of recomputed sums; the order of summation may depend on the machine."""
 
 
 def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None) -> Iterator[ContentProblem]:
-    """Everything that is wrong with what a part's files say.
+    """Yields the problems of a part's content.
 
     Args:
         folder: the part; its layout has been checked.
@@ -66,7 +66,7 @@ def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None
 
 
 def task_problems(manifest: Manifest) -> Iterator[str]:
-    """Tasks of the manifest whose parameters or split the recipe does not draw."""
+    """Yields the differences of the manifest's tasks from those that the recipe draws."""
     environment = _environment(manifest)
     if isinstance(environment, str):
         yield environment
@@ -85,7 +85,7 @@ def task_problems(manifest: Manifest) -> Iterator[str]:
 
 
 def is_close(left: Any, right: Any) -> bool:
-    """JSON values are the same but for the last digits of numbers."""
+    """True if two JSON values are equal, with floats compared to a tolerance of `CLOSE`."""
     if isinstance(left, Mapping) and isinstance(right, Mapping):
         return left.keys() == right.keys() and all(is_close(left[key], right[key]) for key in left)
     if isinstance(left, list | tuple) and isinstance(right, list | tuple):
@@ -96,13 +96,13 @@ def is_close(left: Any, right: Any) -> bool:
 
 
 def _place(error: Exception, folder: Path, *, default: str) -> ContentProblem:
-    """The file within a part that an error names first, and what it says of it."""
+    """The file within a part that an error names first, and the rest of the message."""
     match = re.fullmatch(r"([a-z0-9_./]+?):? (.*)", str(error).removeprefix(f"{folder}/"))
     return (match[1], match[2]) if match else (default, str(error))
 
 
 def _environment(manifest: Manifest) -> Environment | str:
-    """The manifest's environment, or why there is none."""
+    """The manifest's environment, or the reason why it cannot be made."""
     try:
         return manifest.recipe.make_environment()
     except ValidationError as error:

@@ -46,7 +46,7 @@ def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage
     Raises:
         BuildError: there is no dataset at the path, or its work folders are links.
         LockedError: a process works on the dataset; names it.
-        ManifestError: the manifest is damaged, so that nobody knows which tasks are finished.
+        ManifestError: the manifest is damaged, so that the finished tasks are unknown.
     """
     folder = dataset_folder(path)
     if not any((folder / name).exists() for name in (MANIFEST, LOCK, STAGING)):
@@ -60,30 +60,30 @@ def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage
     with lock_file(folder / LOCK, f"dataset {folder}"):
         found = _garbage(folder)
         remove_abandoned(folder)
-        for each in found:
-            if each.path.startswith(CHECKPOINTS) or each.path == f"{STAGING}/{REPAIR}":
-                remove_tree(folder / each.path)
+        for item in found:
+            if item.path.startswith(CHECKPOINTS) or item.path == f"{STAGING}/{REPAIR}":
+                remove_tree(folder / item.path)
     return found
 
 
 def _garbage(folder: Path) -> tuple[Garbage, ...]:
     staging, checkpoints = folder / STAGING, folder / CHECKPOINTS
     found = []
-    for each in sorted(staging.iterdir()) if staging.is_dir() else []:
-        lock = each.with_name(f"{each.name}.lock")
-        if each.suffix == ".lock":
-            is_abandoned = lock_holder(each) is None and not each.with_suffix("").exists()
-        elif each.is_dir():
-            is_abandoned = each.name == REPAIR or (lock.exists() and lock_holder(lock) is None)
+    for path in sorted(staging.iterdir()) if staging.is_dir() else []:
+        lock = path.with_name(f"{path.name}.lock")
+        if path.suffix == ".lock":
+            is_abandoned = lock_holder(path) is None and not path.with_suffix("").exists()
+        elif path.is_dir():
+            is_abandoned = path.name == REPAIR or (lock.exists() and lock_holder(lock) is None)
         else:
             is_abandoned = True
         if is_abandoned:
-            found.append(Garbage(f"{STAGING}/{each.name}", "abandoned by a build that ended", _size(each)))
+            found.append(Garbage(f"{STAGING}/{path.name}", "abandoned by a build that ended", _size(path)))
     finished = _finished_tasks(folder)
-    for each in sorted(checkpoints.iterdir()) if checkpoints.is_dir() else []:
-        match = CHECKPOINT.fullmatch(each.name)
+    for path in sorted(checkpoints.iterdir()) if checkpoints.is_dir() else []:
+        match = CHECKPOINT.fullmatch(path.name)
         if match and int(match[1]) in finished:
-            found.append(Garbage(f"{CHECKPOINTS}/{each.name}", f"task {int(match[1])} is done", _size(each)))
+            found.append(Garbage(f"{CHECKPOINTS}/{path.name}", f"task {int(match[1])} is done", _size(path)))
     return tuple(found)
 
 
@@ -100,4 +100,4 @@ def _finished_tasks(folder: Path) -> set[int]:
 
 def _size(path: Path) -> int:
     files = [path, *path.rglob("*")] if path.is_dir() and not path.is_symlink() else [path]
-    return sum(each.lstat().st_size for each in files if not each.is_dir())
+    return sum(file.lstat().st_size for file in files if not file.is_dir())

@@ -65,7 +65,7 @@ def repair_dataset(
     workers: int | None = None,
     progress: Callable[[BuildEvent], None] = lambda event: None,
 ) -> RepairReport:
-    """Makes exactly the parts again that verification rejects, with the manifest's recipe and seed.
+    """Rebuilds the parts that verification rejects, and only these, with the manifest's recipe and seed.
 
     New parts replace old ones only when all are made and have the ids of the manifest; until then the
     dataset is not touched. What lies in the folder of a replaced part goes with it; every other foreign
@@ -73,13 +73,13 @@ def repair_dataset(
 
     Args:
         path: the dataset's folder or its `manifest.json`.
-        level: of the verification that decides.
+        level: level of the verification that selects the parts.
         workers: units run at the same time.
-        progress: called as the build goes on.
+        progress: called with the events of the build.
 
     Raises:
         ManifestError: the manifest itself is damaged. Delete the part folders that `verify` names and
-            the manifest, then build with the options of the first build: parts that hold are taken in.
+            the manifest, then build with the options of the first build, which keeps the sound parts.
         LockedError: another process works on the dataset.
         ReadOnlyError: the folder cannot be written, and something is damaged.
         NondeterminismError: a part came out with another id; nothing was replaced.
@@ -108,9 +108,9 @@ def _repair(
         remove_abandoned(folder)
         findings = verify_dataset(folder, level=level).findings
         rejected = {
-            (each.task, each.step): each
-            for each in findings
-            if each.task is not None and each.step is not None and not each.foreign
+            (finding.task, finding.step): finding
+            for finding in findings
+            if finding.task is not None and finding.step is not None and not finding.foreign
         }
         keys = tuple(sorted((task, step) for task, step in rejected if task is not None and step is not None))
         failed: tuple[str, ...] = ()
@@ -170,7 +170,9 @@ def _restore(
         make_folders((folder / place).parent)
         move_into_place(new, folder / place)
     groups = _group_files(keys) | {
-        each.file for each in findings if not each.foreign and each.task is None and each.file != MANIFEST
+        finding.file
+        for finding in findings
+        if not finding.foreign and finding.task is None and finding.file != MANIFEST
     }
     restored = []
     for file in sorted(groups):
@@ -197,7 +199,7 @@ def _holds(file: Path) -> bool:
 
 
 def _clear(folder: Path, place: str) -> None:
-    """Takes away what stands at a part's place, or blocks the way to it; never follows a link."""
+    """Removes what is at a part's path, or a link or file on the way to it; never follows a link."""
     blocked = folder_problem(folder, place)
     old = folder / (blocked[0] if blocked else place)
     try:

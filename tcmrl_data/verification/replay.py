@@ -23,9 +23,9 @@ from tcmrl_data.store.manifest import Manifest, PartRecord
 FIRST_STEPS = 5
 STEP_TOLERANCE = 1e-3
 RETURN_ERRORS = 4.0
-"""On another platform rounding differs and dynamics drive it apart. The first 5 steps of every episode must
-agree to 1e-3 (absolute, or relative to the larger value), and the mean return must lie within 4 standard
-errors of the difference of two such means."""
+"""On another platform rounding differs and the dynamics amplify the differences. The first 5 steps of every
+episode must agree to 1e-3 (absolute, or relative to the larger value), and the mean return must lie within 4
+standard errors of the difference of two such means."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Replay:
     Attributes:
         exact: made on the CPU model, with the packages and the physics of the original, so that every bit
             was compared; otherwise within the tolerances of this module.
-        problems: how the two differ.
+        problems: differences from the stored arrays.
     """
 
     task: int

@@ -63,12 +63,12 @@ class Finding:
 
 @dataclass(frozen=True)
 class VerifyReport:
-    """What a verification saw.
+    """Result of a verification.
 
     Attributes:
-        parts: parts looked at.
-        files: files that are as recorded, or are findings.
-        bytes: their size.
+        parts: number of parts checked.
+        files: number of files found, without work files.
+        bytes: their total size.
         findings: everything that is wrong, ordered by file.
     """
 
@@ -89,11 +89,11 @@ def verify_dataset(
     replay: int = 0,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> VerifyReport:
-    """Looks at every file of a dataset and gathers all that is wrong; changes nothing.
+    """Checks every file of a dataset and reports the findings; changes nothing.
 
     Args:
         path: the dataset's folder or its `manifest.json`.
-        level: how closely to look.
+        level: the checks to make, see the module.
         replay: number of parts to make again from their snapshots and seeds, spread over the dataset.
         progress: called with parts done and parts in all.
 
@@ -119,7 +119,7 @@ def verify_dataset(
         len(sizes),
         sum(sizes),
         replays,
-        tuple(sorted(set(run.findings), key=lambda each: (each.file, each.problem))),
+        tuple(sorted(set(run.findings), key=lambda finding: (finding.file, finding.problem))),
         time.monotonic() - started,
     )
 
@@ -130,7 +130,7 @@ class _Verification:
 
     Attributes:
         expected: files that belong to the dataset.
-        opaque: parts whose record is not to be trusted, so that nobody knows what belongs to them.
+        opaque: folders of parts whose record cannot be trusted, so that their files are unknown.
     """
 
     folder: Path
@@ -145,7 +145,7 @@ class _Verification:
     records: dict[Key, PartRecord] = field(default_factory=dict)
 
     def check(self, progress: Callable[[int, int], None]) -> int:
-        """Checks everything but replays; returns the number of parts looked at."""
+        """Checks everything but replays; returns the number of parts checked."""
         try:
             self.manifest = read_manifest(self.folder)
         except ManifestError as error:
@@ -279,7 +279,7 @@ class _Verification:
                 self._add(MANIFEST, problem)
 
     def _check_odd_and_foreign(self) -> None:
-        """Links, pipes and the like anywhere, and files that nothing accounts for."""
+        """Files of other kinds (links, pipes, devices), and files that belong to no part."""
         for file, status in self.scan.files.items():
             problem = file_problem(status)
             is_foreign = file not in self.expected
@@ -289,7 +289,7 @@ class _Verification:
                 self._add(file, "belongs to no part", foreign=True)
         used = {str(parent) for file in self.expected for parent in Path(file).parents}
         for place in self.scan.empty_folders:
-            if place not in used and not any(f"{place}/".startswith(each) for each in self.opaque):
+            if place not in used and not any(f"{place}/".startswith(part) for part in self.opaque):
                 self._add(place, "is a folder that no part has", foreign=True)
         for place, problem in self.scan.problems.items():
             self._add(place, problem, foreign=place not in used)

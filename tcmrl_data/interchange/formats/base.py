@@ -41,7 +41,7 @@ class Format(abc.ABC):
 
         Args:
             dataset: a complete dataset.
-            out: the folder to make; an empty one may stand there.
+            out: the folder to create; it may exist if it is empty.
             snapshots: a rule of `Dataset.select`.
             progress: called as parts are written.
 

@@ -128,18 +128,20 @@ def _attributes(selection: Selection, task: Task) -> Mapping[str, Any]:
 
 def _flat(trajectories: Sequence[Trajectory], *, first: int, step: int) -> dict[str, npt.NDArray[np.generic]]:
     """Transitions of a part behind one another; `first` numbers its first episode."""
-    lengths = [len(each) for each in trajectories]
+    lengths = [len(trajectory) for trajectory in trajectories]
     arrays: dict[str, npt.NDArray[np.generic]] = {
-        "observations": np.concatenate([each.observations[:-1] for each in trajectories]),
-        "next_observations": np.concatenate([each.observations[1:] for each in trajectories]),
-        "actions": np.concatenate([each.actions for each in trajectories]),
-        "rewards": np.concatenate([each.rewards for each in trajectories]),
-        "terminals": np.concatenate([each.terminated for each in trajectories]),
-        "timeouts": np.concatenate([each.truncated for each in trajectories]),
+        "observations": np.concatenate([trajectory.observations[:-1] for trajectory in trajectories]),
+        "next_observations": np.concatenate([trajectory.observations[1:] for trajectory in trajectories]),
+        "actions": np.concatenate([trajectory.actions for trajectory in trajectories]),
+        "rewards": np.concatenate([trajectory.rewards for trajectory in trajectories]),
+        "terminals": np.concatenate([trajectory.terminated for trajectory in trajectories]),
+        "timeouts": np.concatenate([trajectory.truncated for trajectory in trajectories]),
         "episode": np.repeat(np.arange(first, first + len(lengths), dtype=np.int64), lengths),
         "step": np.full(sum(lengths), step, dtype=np.int64),
     }
-    extras = {name: [each.extras[name] for each in trajectories] for name in trajectories[0].extras}
+    extras = {
+        name: [trajectory.extras[name] for trajectory in trajectories] for name in trajectories[0].extras
+    }
     return arrays | {name: np.concatenate(values) for name, values in extras.items()}
 
 

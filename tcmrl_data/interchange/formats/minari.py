@@ -1,8 +1,8 @@
 """Minari, one dataset per task, named `tcmrl/<environment>/task00007-<snapshots>-v0`.
 
 The folder is a root of Minari datasets: with MINARI_DATASETS_PATH naming it, `minari.load_dataset` opens
-them by their names. Episodes come snapshot by snapshot; each carries the seed that its environment was
-reset with, and as metadata its snapshot's step. Further arrays such as `success` are infos with one row
+them by their names. Episodes are ordered by snapshot; every episode has the seed of its environment's
+reset, and as metadata its snapshot's step. Further arrays such as `success` are infos with one row
 more than actions, as Minari has them: the first row is of the reset.
 
 `ref_min_score` is the return of uniform actions; `ref_max_score` that of a controller that knows the task,
@@ -135,7 +135,7 @@ def _write_task(selection: Selection, task: Task, name: str, folder: Path) -> It
     dataset, steps = selection.dataset, selection.steps[task.index]
     require_room_for(folder / "namespace_metadata.json")
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "`.*` is set to None", UserWarning)  # author, link: not ours to say
+        warnings.filterwarnings("ignore", "`.*` is set to None", UserWarning)  # author and link are unknown
         written = minari.create_dataset_from_buffers(name, [], **_description(selection, task))
     source, _ = _best(dataset.references(task.index))
     written.storage.update_metadata({"ref_max_score_source": source, "dataset_root": dataset.manifest.root})
@@ -144,7 +144,7 @@ def _write_task(selection: Selection, task: Task, name: str, folder: Path) -> It
         require_room_for(folder / name / "data" / "main_data.hdf5", trajectories)
         first = written.total_episodes
         written.update_dataset_from_buffer(
-            [_buffer(dataset, task, step, index, each) for index, each in enumerate(trajectories)]
+            [_buffer(dataset, task, step, index, trajectory) for index, trajectory in enumerate(trajectories)]
         )
         written.storage.update_episode_metadata(
             [{"snapshot_step": step}] * len(trajectories), range(first, first + len(trajectories))
@@ -153,7 +153,7 @@ def _write_task(selection: Selection, task: Task, name: str, folder: Path) -> It
 
 
 def _description(selection: Selection, task: Task) -> dict[str, Any]:
-    """What Minari keeps of a task's dataset beside its episodes."""
+    """Metadata of a task's Minari dataset."""
     dataset = selection.dataset
     environment, recipe = dataset.environment, dataset.manifest.recipe
     spec = EnvSpec(
@@ -172,7 +172,9 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
         "ref_min_score": references.uniform,
         "ref_max_score": _best(references)[1],
         "num_episodes_average_score": recipe.rollouts.episodes,
-        "requirements": [f"{each}=={packages[each]}" for each in NEEDED_BY_TASKS if each in packages],
+        "requirements": [
+            f"{package}=={packages[package]}" for package in NEEDED_BY_TASKS if package in packages
+        ],
         "description": (
             f"Task {task.index} of {dataset.name} ({task.split}), parameters "
             f"{json.dumps(dict(task.parameters), sort_keys=True)}. {recipe.about.description} "
@@ -183,7 +185,7 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
 
 
 def _best(references: TaskReferences) -> tuple[str, float]:
-    """What the highest reference score is of, and the score."""
+    """The source of the highest reference score, and the score."""
     if references.oracle is not None:
         return "oracle", references.oracle
     if references.scripted is not None:

@@ -57,7 +57,7 @@ def require_room_for(file: Path, trajectories: Sequence[Trajectory] = ()) -> Non
         StorageError: the disk refuses.
     """
     names = ("observations", "actions", "rewards", "terminated", "truncated")
-    num_bytes = sum(getattr(each, name).nbytes for each in trajectories for name in names)
-    num_bytes += sum(array.nbytes for each in trajectories for array in each.extras.values())
+    num_bytes = sum(getattr(trajectory, name).nbytes for trajectory in trajectories for name in names)
+    num_bytes += sum(array.nbytes for trajectory in trajectories for array in trajectory.extras.values())
     num_bytes = FILE_BYTES + EPISODE_BYTES * len(trajectories) + COPIES * num_bytes
     require_room(file, num_bytes, remedy=REMEDY)

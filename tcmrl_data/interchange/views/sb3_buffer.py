@@ -48,13 +48,13 @@ def to_sb3_buffer(selection: Selection, task: int, *, device: str = "cpu") -> "R
         device=device,
     )
     row = 0
-    for each in trajectories:
-        rows = slice(row, row := row + len(each))
-        buffer.observations[rows, 0] = each.observations[:-1]
-        buffer.next_observations[rows, 0] = each.observations[1:]
-        buffer.actions[rows, 0] = each.actions
-        buffer.rewards[rows, 0] = each.rewards
-        buffer.dones[rows, 0] = each.terminated | each.truncated
-        buffer.timeouts[rows, 0] = each.truncated & ~each.terminated
+    for trajectory in trajectories:
+        rows = slice(row, row := row + len(trajectory))
+        buffer.observations[rows, 0] = trajectory.observations[:-1]
+        buffer.next_observations[rows, 0] = trajectory.observations[1:]
+        buffer.actions[rows, 0] = trajectory.actions
+        buffer.rewards[rows, 0] = trajectory.rewards
+        buffer.dones[rows, 0] = trajectory.terminated | trajectory.truncated
+        buffer.timeouts[rows, 0] = trajectory.truncated & ~trajectory.terminated
     buffer.full = True
     return buffer

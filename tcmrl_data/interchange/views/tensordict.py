@@ -43,7 +43,7 @@ def to_tensordict(selection: Selection) -> "TensorDict":
         for step in selection.steps[task.index]
         for trajectory in selection.dataset.trajectories(task.index, step)
     ]
-    lengths = [len(each) for _, _, each in episodes]
+    lengths = [len(episode) for _, _, episode in episodes]
 
     def flat(arrays: list[Any]) -> "torch.Tensor":
         return torch.from_numpy(np.concatenate(arrays))
@@ -53,13 +53,13 @@ def to_tensordict(selection: Selection) -> "TensorDict":
 
     result: TensorDict = kind(
         {
-            "observation": flat([each.observations[:-1] for _, _, each in episodes]),
-            "action": flat([each.actions for _, _, each in episodes]),
+            "observation": flat([episode.observations[:-1] for _, _, episode in episodes]),
+            "action": flat([episode.actions for _, _, episode in episodes]),
             "next": _outcome(
-                flat([each.observations[1:] for _, _, each in episodes]),
-                flat([each.rewards for _, _, each in episodes]),
-                flat([each.terminated for _, _, each in episodes]),
-                flat([each.truncated for _, _, each in episodes]),
+                flat([episode.observations[1:] for _, _, episode in episodes]),
+                flat([episode.rewards for _, _, episode in episodes]),
+                flat([episode.terminated for _, _, episode in episodes]),
+                flat([episode.truncated for _, _, episode in episodes]),
             ),
             **{name: torch.zeros(sum(lengths), 1, dtype=torch.bool) for name in _FLAGS},
             "episode": numbered(list(range(len(episodes)))),
@@ -108,7 +108,7 @@ def _outcome(
     terminated: "torch.Tensor",
     truncated: "torch.Tensor",
 ) -> dict[str, "torch.Tensor"]:
-    """What follows an action: the `next` entries."""
+    """The `next` entries: observation, reward and flags after an action."""
     return {
         "observation": observations,
         "reward": rewards.unsqueeze(-1),

@@ -22,11 +22,11 @@ Item = dict[str, Tensor]
 
 @final
 class TrajectoryDataset(Dataset[Item]):
-    """Episodes task by task, snapshot by snapshot; a part is read when one of its episodes is asked for.
+    """Episodes task by task, snapshot by snapshot; a part is read when one of its episodes is used.
 
     An item holds new tensors: `observations` (T + 1, observation_dim), one more than actions;
     `actions` (T, action_dim); `rewards`, `terminated` and `truncated` (bool, a time limit is only the
-    latter) and further arrays such as `success`, each (T,); `task` and `step` (of the snapshot), int64
+    latter) and further arrays such as `success`, all (T,); `task` and `step` (of the snapshot), int64
     scalars. Lengths differ where episodes end early: `collate` pads.
 
     Args:
@@ -44,7 +44,7 @@ class TrajectoryDataset(Dataset[Item]):
         self._dataset, self._kept_parts = selection.dataset, kept_parts
         self._parts = [(task.index, step) for task in selection.tasks for step in selection.steps[task.index]]
         arrays = [self._dataset.part(*key).identity.arrays for key in self._parts]
-        self._ends = list(accumulate(each["episode_offsets"].shape[0] - 1 for each in arrays))
+        self._ends = list(accumulate(part["episode_offsets"].shape[0] - 1 for part in arrays))
         self._read: OrderedDict[tuple[int, int], list[Trajectory]] = OrderedDict()
 
     def __len__(self) -> int:
