@@ -1,8 +1,8 @@
-"""The same batches by other libraries, each used as its documentation says, from the same transitions.
+"""Draws the same batches with other libraries, used as their documentation recommends, from the same data.
 
-Every function takes the data and gives the peer's draws by kind of batch. What a draw delivers is what ours
+Every function takes the data and returns the peer's draws by kind of batch. A draw delivers what ours
 does: float32 tensors of observations, actions, rewards, next observations and termination, the same number of
-steps. Where a peer knows no tasks it draws from all of them at once, which is less work than ours.
+steps. A peer that does not know tasks draws from all of them at once, which is less work than ours.
 """
 
 import os
@@ -25,7 +25,7 @@ FIELDS = ("observations", "actions", "rewards", "next_observations", "terminated
 
 @dataclass(frozen=True)
 class Work:
-    """What a batch holds: tasks × transitions, tasks × one trajectory, windows in all of a length."""
+    """Batch sizes: tasks × transitions, tasks × one trajectory, and the number of windows of a length."""
 
     tasks: int
     transitions: int
@@ -99,7 +99,7 @@ def sequence_loop(data: Data, work: Work) -> Draws:
 def torchrl_samplers(data: Data, work: Work) -> Draws:
     """RandomSampler for transitions, SliceSampler for the rest, over one LazyTensorStorage of all tasks.
 
-    The slice samplers are told the ends of episodes and cache what they derive from them.
+    The slice samplers receive the ends of episodes and cache the indices that they compute from them.
     """
     from tensordict import TensorDict
     from torchrl.data import LazyTensorStorage, RandomSampler, ReplayBuffer, SliceSampler

@@ -59,7 +59,7 @@ def curves(recipe: Recipe, tasks: list[Task], seed: int) -> Returns:
 
 
 def difference(left: Returns, right: Returns) -> dict[str, float]:
-    """Mean of left - right, (tasks, seeds) each, and its bootstrap interval over tasks and seeds."""
+    """Mean of left - right, both (tasks, seeds), and its bootstrap interval over tasks and seeds."""
     random = np.random.default_rng(0)
     num_tasks = len(left)
     tasks = random.integers(num_tasks, size=(RESAMPLES, num_tasks))
@@ -75,7 +75,7 @@ def difference(left: Returns, right: Returns) -> dict[str, float]:
 
 
 def compare(sac: Returns, stacked: Returns) -> dict[str, Any]:
-    """Differences of one quantity, (tasks, seeds) each."""
+    """Differences of one quantity, given as two arrays of shape (tasks, seeds)."""
     half = sac.shape[1] // 2
     among_sac, between = difference(sac[:, :half], sac[:, half:]), difference(stacked, sac)
     margin = max(abs(among_sac["low"]), abs(among_sac["high"]))

@@ -39,7 +39,7 @@ SETTLING = 40
 
 
 class _OverError(Exception):
-    """Ends a training once enough has been measured."""
+    """Ends a training after the measurement."""
 
 
 def measure(recipe: Recipe, num_tasks: int, seconds: float) -> float:

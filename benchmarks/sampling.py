@@ -3,14 +3,14 @@
 `python benchmarks/sampling.py [--quick] [--repeats N] [--size NAME] [--folder FOLDER]`
 
 Sizes are 2 million transitions of half-cheetah-vel and of ml1, in random numbers (`--quick`: 1 % of them),
-written below FOLDER and kept there, else in a temporary folder. Each size runs in a process of its own on one
-core. Everything that is compared is measured in turns, once per repetition: a number is the median over the
+written to FOLDER and kept there, or to a temporary folder. Every size runs in a separate process on one
+core. All contestants are measured in turns, once per repetition: a number is the median over the
 repetitions, `spread` the smallest and the largest; ratios are taken within a repetition.
 
 Kinds: `transitions` 16 tasks × 256; `trajectories` 16 whole episodes, one per task; `windows` 512 of 10
 steps; `full_step` 16 × 256 transitions, 16 context and 16 execution episodes, and as many windows as the
-context episodes have. Peers: see `_peers.py`; they need the extra `tcmrl[benchmark]`, and one that is missing
-is a reason instead of rates. Files are in the page cache, for ours and for peers.
+context episodes have. Peers: see `_peers.py`; they need the extra `tcmrl[benchmark]`. A missing peer has
+a reason in the place of its rates. Files are in the page cache, for ours and for peers.
 """
 
 import argparse
@@ -53,7 +53,7 @@ COPIED_BYTES = 2**28
 
 
 def main() -> None:
-    """Writes the datasets, then measures each size in a process of its own."""
+    """Writes the datasets, then measures every size in a separate process."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="a hundredth of the data, to see that it runs")
     parser.add_argument("--repeats", type=int, default=5)
@@ -77,12 +77,12 @@ def main() -> None:
 
 
 def measure(folder: Path, repeats: int) -> dict[str, Any]:
-    """The object of one size."""
+    """The results of one size."""
     core = max(os.sched_getaffinity(0))
     os.sched_setaffinity(0, {core})
     torch.set_num_threads(1)
     opening = _opening(folder, repeats)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # before any peer is there
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # before any peer is loaded
     dataset = tcmrl_data.open_dataset(folder)
     settings = dataset.environment.settings
     work = Work(tasks=16, transitions=256, windows=512, window_length=10, horizon=settings.horizon)
@@ -175,7 +175,7 @@ def _our_draws(dataset: tcmrl_data.Dataset, work: Work) -> dict[str, Draw]:
 def _peer_draws(
     data: Data, work: Work, folder: Path
 ) -> tuple[dict[str, Mapping[str, Draw]], dict[str, dict[str, str]]]:
-    """Every peer's draws, and of each that cannot be measured the reason."""
+    """The draws of every peer, and the reason for every peer that cannot be measured."""
     makers: dict[str, Callable[[], dict[str, Mapping[str, Draw]]]] = {
         "torchrl": lambda: {"torchrl": _peers.torchrl_samplers(data, work)},
         "minari": lambda: _peers.minari_datasets(data, work, folder.with_name(f"{folder.name}-minari")),

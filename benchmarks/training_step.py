@@ -1,9 +1,9 @@
 """Measures the time of a training step and its parts against the peak of matrix products. Prints JSON.
 
 `python benchmarks/training_step.py [--threads N] [--algorithm NAME] [--precision NAME] [--repeats N]`;
-made-up batches at the paper's network sizes, no dataset needed. Times are the least of the repeats; the peak
-is that of float32 in either precision. On a machine that others use, read the shares by CPU time: step and
-peak in seconds of the process's threads, the one beside the other.
+random batches at the paper's network sizes, no dataset needed. Times are the minimum of the repeats; the peak
+is that of float32 in both precisions. On a shared machine, read the shares by CPU time: they compare
+operations per processor second of the step and of the peak.
 """
 
 import argparse
@@ -33,7 +33,7 @@ PEAK_SIZE = 1024
 
 @dataclass(frozen=True)
 class Sizes:
-    """What a batch holds; observations and actions as in the environment that names the case."""
+    """Batch sizes, with the observations and actions of the environment that names the case."""
 
     observation_dim: int
     action_dim: int
@@ -58,7 +58,7 @@ GROWTH = {
 
 
 class Stopwatch:
-    """Adds up wall-clock seconds of functions by name, without those of the named functions they call."""
+    """Adds up wall-clock seconds of functions by name, less the time of other named functions they call."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
@@ -133,7 +133,7 @@ def made_up(sizes: Sizes, algorithm: str, precision: str) -> tuple[ContextAlgori
 
 
 def matmul_peak() -> tuple[float, float]:
-    """Operations per second of one square float32 product, and per second of its threads' processor time."""
+    """Operations of a square float32 product, per wall-clock second and per second of processor time."""
     left, right = torch.randn(2, PEAK_SIZE, PEAK_SIZE)
     out = torch.empty(PEAK_SIZE, PEAK_SIZE)
     wall = processor = float("inf")
@@ -146,7 +146,7 @@ def matmul_peak() -> tuple[float, float]:
 
 
 def products(widths: list[int], rows: int, *, weights: bool = True, inputs: int = 0) -> int:
-    """Operations of a perceptron: forward, its weights' gradients, and those of `inputs` of its inputs."""
+    """Operations of a perceptron: forward pass, weight gradients, and gradients of `inputs` of its inputs."""
     layers = [a * b for a, b in itertools.pairwise(widths)]
     gradients = sum(layers) if weights else 0
     if weights or inputs:
@@ -155,7 +155,7 @@ def products(widths: list[int], rows: int, *, weights: bool = True, inputs: int 
 
 
 def needed_work(made: ContextAlgorithm, sizes: Sizes) -> int:
-    """Operations of the perceptrons that the method asks for, gradients that no one reads left out."""
+    """Operations of the perceptrons that the method needs, without gradients that are never read."""
 
     def widths(network: nn.Module) -> list[int]:
         layers = [module for module in network.modules() if isinstance(module, nn.Linear)]
@@ -174,16 +174,16 @@ def needed_work(made: ContextAlgorithm, sizes: Sizes) -> int:
         width = widths(network)
         if name == "encoder":
             total += products(width, context + execution + windows)
-        elif name == "extractor":  # over all of a task's context, and over each trajectory by itself
+        elif name == "extractor":  # over the whole context of a task, and over every single trajectory
             total += products(width, 2 * context + execution, inputs=width[0])
-        elif name == "estimator":  # with the context, and with the reverse context, its weights held fixed
+        elif name == "estimator":  # with the context, and with the reverse context and fixed weights
             total += products(width, execution, inputs=learner.latent)
             total += products(width, execution, weights=False, inputs=learner.latent)
     return total
 
 
 def measure(sizes: Sizes, *, algorithm: str, precision: str, repeats: int) -> dict[str, Any]:
-    """Seconds and operations of a step, whole and by part."""
+    """Seconds and operations of a step, in total and by part."""
     made, batch = made_up(sizes, algorithm, precision)
     made.update(batch, 1)
     with FlopCounterMode(display=False) as counter:
@@ -210,9 +210,9 @@ def measure(sizes: Sizes, *, algorithm: str, precision: str, repeats: int) -> di
 
 
 def components(sizes: Sizes, *, algorithm: str, precision: str, repeats: int) -> dict[str, float]:
-    """Milliseconds per step of each part; a part's own, without those inside it.
+    """Milliseconds per step of every part, without the time of the parts inside it.
 
-    Last of all: what is watched stays so.
+    Call this last: the functions stay wrapped afterwards.
     """
     made, batch = made_up(sizes, algorithm, precision)
     made.update(batch, 1)

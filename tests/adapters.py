@@ -33,10 +33,10 @@ class GoalController(Controller):
 
 
 class GoalReader(Algorithm):
-    """Adapts perfectly: finds the goal that explains the rewards of the first trajectory it is given.
+    """Adapts perfectly: finds the goal that explains the rewards of the first trajectory.
 
     Attributes:
-        seen: the number of trajectories that each call of `adapt` got, lane by lane.
+        seen: the number of trajectories that every call of `adapt` received, by lane.
     """
 
     def __init__(self) -> None:
@@ -71,7 +71,7 @@ class GoalSeeker(GoalReader):
 
 
 class SeekingController(GoalController):
-    """Walks to the goals that the episodes so far show."""
+    """Walks to the goals that the previous episodes show."""
 
     def __init__(self, goals: np.ndarray) -> None:
         super().__init__(goals)
@@ -91,7 +91,7 @@ def arena(
 
 
 def oracle(dataset: Dataset, task: Task) -> float:
-    """The return of the controller that knows the task."""
+    """The return of the oracle controller."""
     found = dataset.references(task.index).oracle
     assert found is not None
     return found

@@ -1,4 +1,4 @@
-"""Command lines run in this process, and what a refused one must look like."""
+"""Runs command lines in this process, and checks the output of refused ones."""
 
 from collections.abc import Callable
 

@@ -50,7 +50,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leaves tests that need a network of their own to tests/test_namespace.py, which makes one."""
+    """Skips tests that need a separate network; tests/test_namespace.py makes one and runs them."""
     if not has_only_loopback():
         elsewhere = [item for item in items if item.get_closest_marker("loopback")]
         items[:] = [item for item in items if item not in elsewhere]
@@ -59,14 +59,14 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 @pytest.fixture
 def sweep(request: pytest.FixtureRequest) -> int:
-    """Stride through sweeps that take minutes in full; `--sweep 1` tries every case."""
+    """Step between the tested cases of long sweeps; `--sweep 1` tests every case."""
     stride: int = request.config.getoption("--sweep")
     return stride
 
 
 @pytest.fixture(scope="session")
 def mark() -> Iterator[str]:
-    """Stands in the environment of every process that this session starts."""
+    """A mark in the environment of every process that this session starts."""
     value = uuid.uuid4().hex
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(MARK, value)

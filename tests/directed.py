@@ -1,6 +1,6 @@
-"""Workers that die or wait at a chosen place, so that no test has to hit a moment.
+"""Workers that die or wait at a chosen place, so that no test depends on timing.
 
-A unit's spec carries the directions; files in a folder count what happened. As a program: such a worker.
+A unit's spec carries the directions; files in a folder count the events. The program is the worker.
 """
 
 import importlib
@@ -26,22 +26,22 @@ WORK = {
     BUILD: ("tcmrl_data.build.worker", "_build_parts"),
     EXPERIMENT: ("tcmrl_algo.experiment.job", "_serve"),
 }
-"""What the workers of their units do."""
+"""Module and function that do the work of a unit, by the module that makes the unit."""
 
 Report = Callable[[Mapping[str, Any]], None]
 
 
 @dataclass(frozen=True)
 class Directions:
-    """What becomes of the workers of some units.
+    """Where and how often the workers of some units die or wait.
 
     Attributes:
-        folder: holds a file for every death, one for every worker that waits, and `hold` while they shall.
-        at: `part` after a worker told of a part, `steps` after it told of steps, `publishing` when it has
+        folder: holds a file per death, a file per waiting worker, and `hold` until `release`.
+        at: `part` after a worker reported a part, `steps` after it reported steps, `publishing` when it has
             written half of a part.
-        passes: how often a worker gets by that place first.
-        deaths: how many workers are killed there, all units together; those after them wait.
-        unit: the one unit that is meant, or all.
+        passes: how often a worker passes that place before it dies or waits.
+        deaths: how many workers are killed there, over all units; the workers after them wait.
+        unit: id of the only unit that gets directions; None for all units.
         driver: the module that makes the units.
     """
 
@@ -59,7 +59,7 @@ class Directions:
         return self
 
     def release(self) -> None:
-        """Lets workers go on."""
+        """Lets workers continue."""
         (Path(self.folder) / "hold").unlink()
 
     def died(self) -> set[int]:
@@ -71,7 +71,7 @@ class Directions:
         return {int(file.suffix[1:]) for file in Path(self.folder).glob("waiting.*")}
 
     def direct(self, unit: Unit) -> Unit:
-        """The unit with these directions, if it is meant."""
+        """The unit with these directions, if they apply to it."""
         if self.unit not in (None, unit.id):
             return unit
         Path(self.folder).mkdir(exist_ok=True)
@@ -83,12 +83,12 @@ class Directions:
         patch.setattr(made, "Unit", lambda *values, **named: self.direct(Unit(*values, **named)))
 
     def wait(self, driver: "subprocess.Popen[str]", workers: int = 1) -> None:
-        """Waits until so many workers wait, or the process that drives them has ended."""
+        """Waits until `workers` workers wait, or the process that drives them has ended."""
         wait_for(lambda: len(self.waiting()) >= workers or driver.poll() is not None, "workers that wait")
         assert driver.poll() is None, driver.communicate()
 
     def obey(self) -> None:
-        """Dies or waits here, as directed."""
+        """Kills this process or waits, as the directions say."""
         folder = Path(self.folder)
         if len(self.died()) < self.deaths:
             (folder / f"died.{os.getpid()}").touch()

@@ -1,4 +1,4 @@
-"""Commands run where the disk is small or read-only: in a mount namespace of their own, as root or not."""
+"""Runs commands on a small or read-only disk, in a separate mount namespace, as root or not."""
 
 import os
 import shlex
@@ -25,7 +25,7 @@ def read_only(folder: Path) -> str:
 
 
 def run_mounted(mount: str, *arguments: object, then: str = "true") -> "subprocess.CompletedProcess[str]":
-    """Runs `tcmrl-data` after a mount that only this command sees; skips the test where none can be made.
+    """Runs `tcmrl-data` after a mount that only this command sees; skips the test where a mount fails.
 
     Args:
         mount: shell command.

@@ -1,4 +1,4 @@
-"""Environments as their recipes make them, and episodes played in them, for the tests of environments."""
+"""Environments made by their recipes, and episodes rolled out in them, for the tests of environments."""
 
 import functools
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ STEPS = 25
 
 
 def some_members(family: type[Environment]) -> list[str]:
-    """The family's environments, or three evenly spaced ones of many."""
+    """The family's environments, or three evenly spaced ones of a large family."""
     names = family.members()
     number = min(MOST_MEMBERS, len(names))
     return [names[index * (len(names) - 1) // max(1, number - 1)] for index in range(number)]
@@ -42,7 +42,7 @@ def actions_of(environment: Environment, seed: int = 0, steps: int = STEPS) -> n
 
 
 def play(env: gymnasium.Env[Any, Any], actions: np.ndarray, *, seed: int) -> list[tuple[Any, ...]]:
-    """Everything an episode returns, in a form that compares exactly."""
+    """All arrays of an episode, in a form that compares exactly."""
     observation, info = env.reset(seed=seed)
     episode: list[tuple[Any, ...]] = [(observation.tobytes(), info)]
     for action in actions:

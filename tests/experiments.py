@@ -12,7 +12,7 @@ SMALL = {
 
 
 def tables(dataset: Path, **changes: Any) -> dict[str, Any]:
-    """What an experiment file would hold: two methods, two seeds, a curve of two points."""
+    """The tables of an experiment file: two methods, two seeds, a curve of two points."""
     return {
         "schema": 1,
         "name": "small",

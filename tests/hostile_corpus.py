@@ -1,4 +1,4 @@
-"""A stranger's datasets: the ways we know in which one may lie, forged so that only the lie gives it away."""
+"""Forged datasets for all known attacks, with consistent digests, so that only the attack can be found."""
 
 import json
 import os
@@ -26,7 +26,7 @@ Values = dict[str, Any]
 
 
 class Forge:
-    """A dataset of two parts whose files a careful forger changes, digests included.
+    """A dataset of two parts whose files and digests the tests forge.
 
     Attributes:
         folder: the dataset.
@@ -39,14 +39,14 @@ class Forge:
         self.part = folder / PART
 
     def write(self, name: str, data: bytes) -> None:
-        """Replaces a file of the part and what its record says of it."""
+        """Replaces a file of the part and its entry in the part's record."""
         (self.part / name).write_bytes(data)
         self.record(
             lambda values: values["files"].update({name: {"size": len(data), "sha256": sha256(data)}})
         )
 
     def rename(self, name: str) -> None:
-        """Takes a file out of the part; its record still names it."""
+        """Moves a file out of the part; the part's record still names it."""
         (self.part / name).rename(self.outside / "taken")
 
     def record(self, change: Callable[[Values], object], *, text: Callable[[str], str] = str) -> None:
@@ -59,7 +59,7 @@ class Forge:
         self.manifest(lambda manifest: self._name_part(manifest, values["id"], sha256(file.read_bytes())))
 
     def manifest(self, change: Callable[[Values], object], *, root: bool = True) -> None:
-        """Changes `manifest.json` and seals it again."""
+        """Changes `manifest.json` and updates its root."""
         file = self.folder / MANIFEST
         values = json.loads(file.read_bytes())
         change(values)
@@ -69,7 +69,7 @@ class Forge:
         file.write_bytes(seal(values))
 
     def text(self, old: bytes, new: bytes) -> None:
-        """Changes the manifest's bytes without sealing."""
+        """Changes the manifest's bytes without updating its root."""
         file = self.folder / MANIFEST
         assert old in file.read_bytes()
         file.write_bytes(file.read_bytes().replace(old, new, 1))
@@ -80,7 +80,7 @@ class Forge:
         self.write(f"{array}/zarr.json", json.dumps(values).encode())
 
     def rows(self, num_rows: int) -> None:
-        """Claims that many steps in every array and every record; chunks stay as they are."""
+        """Sets the number of steps in every array and every record; chunks stay unchanged."""
         arrays = json.loads((self.part / "part.json").read_bytes())["identity"]["arrays"]
         for name, array in arrays.items():
             if name != "episode_offsets":
@@ -101,7 +101,7 @@ class Forge:
         self.write("policy.safetensors", save(tensors))
 
     def header(self, change: Callable[[Values], object]) -> None:
-        """Changes the header of the safetensors file, its data left as they are."""
+        """Changes the header of the safetensors file; its data stay unchanged."""
         data = (self.part / "policy.safetensors").read_bytes()
         end = 8 + int.from_bytes(data[:8], "little")
         values = json.loads(data[8:end])
@@ -110,7 +110,7 @@ class Forge:
         self.write("policy.safetensors", struct.pack("<Q", len(text)) + text + data[end:])
 
     def payload(self) -> bytes:
-        """A pickle that leaves a mark when it is read."""
+        """A pickle that writes the marker file when it is read."""
         marker = str(self.marker)
 
         class Bomb:
@@ -131,9 +131,9 @@ class Case:
 
     Attributes:
         damage: makes it.
-        stage: the first to refuse: opening, reading arrays and policy, or deep verification alone.
+        stage: the first stage that must refuse: opening, reading arrays and policy, or deep verification.
         file: end of the path that the error and a finding must name.
-        words: what the error must say, the field above all.
+        words: what the error must say, at least the field.
     """
 
     name: str
@@ -144,7 +144,7 @@ class Case:
 
 
 def base(tiny: Path, folder: Path) -> Path:
-    """Two parts of the tiny dataset as a complete one."""
+    """Two parts of the tiny dataset as a complete dataset."""
     for task in TASKS:
         shutil.copytree(tiny / part_folder(task, STEP), folder / part_folder(task, STEP))
         for parent in Path(part_folder(task, STEP)).parents:
@@ -210,7 +210,7 @@ def _name(name: str) -> Callable[[Forge], object]:
 
 
 def _array_name(name: str) -> Callable[[Forge], object]:
-    """An array of another name, its files lying there too where a file system allows the name."""
+    """An array of another name, with its files where the file system allows the name."""
 
     def damage(forge: Forge) -> None:
         forge.record(
@@ -231,7 +231,7 @@ def _zarr(array: str = "rewards", **fields: Any) -> Callable[[Forge], object]:
 
 
 def _link(name: str) -> Callable[[Forge], object]:
-    """A link, to what used to stand there and now lies outside."""
+    """A symbolic link to the original file, which is moved outside the dataset."""
 
     def damage(forge: Forge) -> None:
         path = forge.folder / name
@@ -269,13 +269,13 @@ def _chunk(data: bytes) -> Callable[[Forge], object]:
 
 
 def _bomb(forge: Forge) -> None:
-    """Every array claims 2**26 steps; one really decodes to them."""
+    """Every array claims 2**26 steps; one array really decodes to that many."""
     forge.rows(2**26)
     forge.write("terminated/c/0", rle_frame(2**26))
 
 
 def _many_arrays(forge: Forge) -> None:
-    """Arrays that are each below the floor and together far above it."""
+    """Arrays whose single sizes are below the limit and whose sum is far above it."""
     forge.record(
         lambda values: values["identity"]["arrays"].update(
             {f"extra{i}": values["identity"]["arrays"]["rewards"] for i in range(40)}
@@ -297,7 +297,7 @@ def _swap(forge: Forge) -> None:
 
 
 def _nan_array(forge: Forge) -> None:
-    """NaN rewards, encoded and sealed as if they had been rolled out."""
+    """NaN rewards with consistent digests, as if a rollout had returned them."""
     from tcmrl_data.store.arrays import array_digests, encode_arrays, read_arrays
 
     rewards = read_arrays(forge.part, ["rewards"])["rewards"].copy()

@@ -28,7 +28,7 @@ ORPHAN_SECONDS = 60.0
 
 @dataclass
 class Figures:
-    """What a sweep saw; all but the first four must be zero."""
+    """Counts of a sweep; all but the first four must be zero."""
 
     kills: int = 0
     driver_kills: int = 0
@@ -42,7 +42,7 @@ class Figures:
 
 
 def command(out: Path, arguments: Sequence[str]) -> list[str]:
-    """A build of point-robot-wind in a process of its own."""
+    """A build of point-robot-wind in a separate process."""
     start = "from tcmrl_cli.data import main; main()"
     options = ["--profile", "quick", "--workers", "2", "--out", str(out), "--quiet"]
     return [sys.executable, "-c", start, "build", "point-robot-wind", *options, *arguments]
@@ -57,16 +57,16 @@ def marked(mark: str) -> list[int]:
                 if f"{MARK}={mark}".encode() in (entry / "environ").read_bytes():
                     found.append(int(entry.name))
             except OSError:
-                continue  # it ended meanwhile, or is not ours
+                continue  # it ended, or belongs to another user
     return sorted(found)
 
 
 def kill_once(
     process: "subprocess.Popen[bytes]", mark: str, seconds: float, figures: Figures, dice: random.Random
 ) -> None:
-    """Waits, kills the driver, a worker or all of them, and sees that nobody outlives the driver.
+    """Waits, kills the driver, a worker or all of them, and counts processes that outlive the driver.
 
-    Where a worker shall die, the time is counted from when one lives.
+    If a worker is to be killed, the waiting time starts when the first worker runs.
     """
     what = dice.choice(["driver", "worker", "all"])
     while what != "driver" and process.poll() is None and len(marked(mark)) < 2:
@@ -131,7 +131,7 @@ def compare(out: Path, manifest: Manifest, reference: Manifest, figures: Figures
 
 
 def run_sweep(kills: int, *, pause: float, seed: int, arguments: Sequence[str]) -> Figures:
-    """Kills builds until `kills` processes have died, each build then run to its end."""
+    """Kills builds until `kills` processes have died; every build is then run to its end."""
     figures, dice = Figures(), random.Random(seed)
     with tempfile.TemporaryDirectory() as folder:
         reference = Path(folder) / "reference"

@@ -1,4 +1,4 @@
-"""A made-up problem, its batches and trajectories: three tasks, observations of 3, actions of 2."""
+"""A synthetic problem, its batches and trajectories: three tasks, observations of 3, actions of 2."""
 
 from dataclasses import replace
 from typing import Any
@@ -96,7 +96,7 @@ def batch_for(request: BatchRequest, *, seed: int) -> Batch:
 
 
 def with_steps(plain: Batch, **changed: Steps) -> Batch:
-    """The batch with other steps for some kinds."""
+    """The batch with the steps of some kinds replaced."""
     return replace(plain, steps={**plain.steps, **changed})
 
 

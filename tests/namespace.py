@@ -1,6 +1,6 @@
-"""A network of its own for tests that talk over one: a Linux namespace that holds the loopback alone.
+"""A separate network for tests that communicate over one: a Linux namespace with only the loopback.
 
-As a program: brings the loopback up, then becomes the program that follows.
+Run as a program, it brings the loopback up and executes the command in its arguments.
 """
 
 import fcntl
