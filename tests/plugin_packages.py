@@ -8,7 +8,7 @@ def install(site: Path, package: str, *, modules: Mapping[str, str], declares: M
     """Writes modules and the metadata of a distribution into a folder that stands on `sys.path`.
 
     Args:
-        site: the folder; made where missing.
+        site: the folder; created if missing.
         package: name of the distribution.
         modules: source code by module name.
         declares: lines `name = module:Class`, by entry point group.

@@ -1,4 +1,4 @@
-"""Samplers over episodes made in a test, packed as a dataset's parts are."""
+"""Samplers over a test's own episodes, packed like the parts of a dataset."""
 
 from collections.abc import Sequence
 
@@ -32,7 +32,7 @@ def sampler_of(
 
 
 def numbered(task: int, episode: int, steps: int) -> Trajectory:
-    """An episode whose observations say where they come from: (task, episode, t)."""
+    """An episode whose observations state their origin: (task, episode, t)."""
     observations = np.array([[task, episode, t] for t in range(steps + 1)], dtype=np.float32)
     truncated = np.arange(1, steps + 1) == steps
     terminated = truncated & (episode % 2 == 0)

@@ -1,4 +1,4 @@
-"""Disks that fail or forget, and an engine that publishes parts made before: to try every file operation."""
+"""Simulated disks that fail or lose data, and an engine that publishes finished parts."""
 
 import errno
 import os
@@ -24,7 +24,7 @@ Operation = tuple[str, Path, Path | bytes | None]
 
 
 class PreparedParts:
-    """All parts of one task of a real dataset, published again through the same code as a worker's."""
+    """All parts of one task of a real dataset, published again by the code that workers use."""
 
     def __init__(self, dataset: Dataset, recipe: Recipe, task: int) -> None:
         self.recipe, self.task = recipe, task
@@ -59,7 +59,7 @@ class PreparedParts:
 
 
 class RecordingDisk(Disk):
-    """Does everything, and writes it down."""
+    """Executes and records every operation."""
 
     def __init__(self) -> None:
         self.log: list[Operation] = []
@@ -134,7 +134,7 @@ def run_with_fault(parts: PreparedParts, out: Path, at: int, fault: Fault) -> in
 
 @dataclass
 class _Node:
-    """A file or folder as the system sees it, and as the disk would hold it after a power cut."""
+    """A file or folder as the system sees it, and its content on disk after a power cut."""
 
     is_folder: bool
     content: bytes = b""
@@ -154,7 +154,7 @@ class PowerCut:
         self._tree = _Node(is_folder=True)
 
     def apply(self, operation: Operation) -> None:
-        """Does one recorded operation in memory."""
+        """Applies one recorded operation in memory."""
         name, path, more = operation
         if name == "sync":
             node = self._node(path)
@@ -167,7 +167,7 @@ class PowerCut:
             self._node(path.parent).entries[path.name] = _Node(name == "make_folder", content)
 
     def leave(self, out: Path, *, names_survive: bool) -> None:
-        """Writes what is left: unsynced bytes are gone, and unsynced names too unless they survive."""
+        """Writes the state after a power cut, without unsynced bytes; unsynced names may survive."""
         self._write(self._tree, out, names_survive)
 
     def _write(self, node: _Node, path: Path, names_survive: bool) -> None:

@@ -8,7 +8,7 @@ from tcmrl_data import Trajectory
 
 @st.composite
 def trajectories(draw: st.DrawFn, *, min_steps: int = 0, max_steps: int = 12) -> Trajectory:
-    """One episode of any length, ended by termination, truncation or (an odd part) neither."""
+    """One episode of any length, ended by termination or truncation; with 0 steps by neither."""
     steps = draw(st.integers(min_steps, max_steps))
     random = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
     terminated, truncated = np.zeros((2, steps), dtype=bool)

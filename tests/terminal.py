@@ -1,4 +1,4 @@
-"""Commands run in a real pseudo-terminal of a given width, and what fits into one."""
+"""Runs commands in a real pseudo-terminal of a given width, and checks that their lines fit."""
 
 import fcntl
 import os
@@ -19,7 +19,7 @@ CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 @dataclass(frozen=True)
 class Shown:
-    """What a command left in its terminals, without control codes.
+    """The output of a command in its terminals, without control codes.
 
     Attributes:
         code: its exit code.
@@ -48,7 +48,7 @@ def in_terminal(
 
 
 def show_in_terminal(code: str, *, columns: int = 80) -> Shown:
-    """As `in_terminal`, for Python code."""
+    """Like `in_terminal`, for Python code."""
     return _show(["-c", code], columns, {})
 
 
@@ -87,7 +87,7 @@ class _Terminal:
         while True:
             try:
                 found = os.read(self._driver, 65536)
-            except OSError:  # Linux reports EIO when the last writer has gone
+            except OSError:  # Linux reports EIO after the last writer has closed the terminal
                 return
             if not found:
                 return

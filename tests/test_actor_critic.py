@@ -1,4 +1,4 @@
-"""The offline actor-critic: bounds, who trains whom, targets, BRAC."""
+"""The offline actor-critic: bounds, which loss trains which network, targets, BRAC."""
 
 from dataclasses import replace
 from types import ModuleType
@@ -106,7 +106,7 @@ def test_value_mode_lowers_each_states_target_by_its_own_divergence(monkeypatch:
     divergences = seen["dual_divergence"][1]
     torch.testing.assert_close(without - with_penalty, 7.0 * divergences)
     assert divergences.std() > 0
-    lowest = actor_critic.bounds[0]  # of what rewards add up to; a penalised value may lie below
+    lowest = actor_critic.bounds[0]  # the lowest return of the rewards; a penalised value may be lower
     assert (seen["q_loss"][0] == lowest).all() and (seen["q_loss"][1] < lowest).all()
 
 

@@ -1,4 +1,4 @@
-"""Other libraries' objects: each library itself reads what is handed to it."""
+"""Objects of other libraries; the library itself reads them in every test."""
 
 import os
 import pickle
@@ -33,7 +33,7 @@ from tests.conftest import TASKS
 
 
 def terminated_early(original: Callable[..., list[Trajectory]]) -> Callable[..., list[Trajectory]]:
-    """Cuts episode e of a part to 20 - e steps; odd ones are terminated, even ones truncated."""
+    """Cuts episode e of a part to 20 - e steps; odd episodes are terminated, even ones truncated."""
 
     def trajectories(self: Dataset, task: int, step: int) -> list[Trajectory]:
         result = []
@@ -266,7 +266,7 @@ def test_minari_knows_the_scores_and_makes_the_task_again(
 def test_minari_recovers_an_environment_with_the_spaces_of_the_data(
     tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What `check_env_recovery` of Minari's own tests asserts, and that observations lie in their space."""
+    """The assertions of `check_env_recovery` in Minari's tests; observations also lie in their space."""
     minari = pytest.importorskip("minari")
     MinariFormat().export(tiny, tmp_path / "out", snapshots="last")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))

@@ -1,4 +1,4 @@
-"""What is said across seeds, and what is not."""
+"""Statistics and verdicts across seeds."""
 
 import itertools
 

@@ -1,4 +1,4 @@
-"""What every method keeps: determinism, stages, tensors, adaptation as its capabilities say."""
+"""The contract of every method: determinism, stages, tensors, adaptation as its capabilities state."""
 
 import inspect
 import json
@@ -39,7 +39,7 @@ class Made:
         self.algorithm: Algorithm = self.method.create(self.problem, self.settings, self.config)
 
     def batch(self, step: int) -> Batch:
-        """What the sampler gives at a step: what its stage requests, and nothing else."""
+        """The batch of a step: the kinds that its stage requests, and no other."""
         stage = self.stages.at(step).stage
         (request,) = [found.request for found in self.stages if found.name == stage]
         return batch_for(request, seed=step)
@@ -49,7 +49,7 @@ class Made:
             self.algorithm.update(self.batch(step), step)
 
     def adapt(self, lanes: list[list[Trajectory]], tasks: tuple[int, ...] = (0, 1)) -> Controller:
-        """Adapted to the trajectories; by the parameters of these training tasks where they may be seen."""
+        """The controller adapted to the trajectories, or to the tasks' parameters for a privileged method."""
         known = self.problem.privileged
         return self.algorithm.adapt(lanes, privileged=None if known is None else known[list(tasks)])
 
@@ -100,7 +100,7 @@ def test_updates_are_a_function_of_seed_and_step(name: str) -> None:
 @every
 @pytest.mark.parametrize("mode", ["off", "value"])
 def test_a_learner_goes_on_from_its_tensors_at_every_step(name: str, mode: str) -> None:
-    """In the middle of a stage and at its end, the next step is that of an uninterrupted training."""
+    """In the middle of a stage and at its end, the next step equals that of an uninterrupted training."""
     straight = Made(name, brac={"mode": mode})
     for step in range(1, STEPS + 1):
         resumed = Made(name, brac={"mode": mode})
@@ -143,7 +143,7 @@ def test_adaptation_changes_no_tensor_and_follows_every_lane_alone(name: str) ->
     assert actions.shape == (2, ACTION_DIM)
     assert np.isfinite(actions).all() and np.abs(actions).max() <= 1
     alone = [act(made.adapt([lane], tasks=(index,)), lanes=1)[0] for index, lane in enumerate(LANES)]
-    np.testing.assert_allclose(np.array(alone), actions, rtol=1e-4, atol=1e-6)  # neighbours play no part
+    np.testing.assert_allclose(np.array(alone), actions, rtol=1e-4, atol=1e-6)  # lanes are independent
     assert_equal(before, made.algorithm.tensors())
 
 

@@ -1,4 +1,4 @@
-"""One contract for every behavior source; what a source trains is tested in files of its own."""
+"""One contract for every behavior source; the training of a source is tested in separate files."""
 
 import functools
 import json

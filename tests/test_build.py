@@ -161,7 +161,7 @@ def test_a_seed_beyond_int64_is_refused(tiny_recipe: Recipe, tmp_path: Path) -> 
 
 @final
 class HastyEngine(BaseEngine):
-    """Says that every unit is done and does nothing."""
+    """Reports every unit as done and does nothing."""
 
     name = "hasty"
 

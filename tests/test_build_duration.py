@@ -25,7 +25,7 @@ def test_a_probe_shortens_the_warm_up_and_nothing_else(name: str) -> None:
 
 
 def test_the_probes_clock_parts_warm_up_from_updates(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Steps of 0.01 s until 200 are done, a report while libraries set themselves up, then 1 s and 3 s."""
+    """Steps of 0.01 s until 200 are done, a report while libraries initialise, then 1 s and 3 s."""
     now = itertools.accumulate([0.0] + [0.2] * 10 + [500.0, 20.0, 60.0])
     monkeypatch.setattr(probe.time, "monotonic", lambda: next(now))
     clock = probe.Clock(200)

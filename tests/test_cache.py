@@ -1,4 +1,4 @@
-"""The cache of decoded steps: equal rows, eviction, what is torn, and memory while it is made."""
+"""The cache of decoded steps: equal rows, eviction, torn entries, and memory during decoding."""
 
 import json
 import os
@@ -39,7 +39,7 @@ REQUEST = BatchRequest(
 
 @pytest.fixture(autouse=True)
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Every test has a cache of its own."""
+    """Every test has a separate cache."""
     monkeypatch.setenv("TCMRL_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
@@ -180,7 +180,7 @@ def test_a_damaged_part_leaves_no_entry(tiny_copy: Callable[[], Path], folder: P
 def test_decoding_takes_the_memory_of_the_parts_at_work(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A table of 40 parts, 1 MB each, by one reader."""
+    """A table of 40 parts of 1 MB, decoded by one reader."""
 
     def fill(part: PartRows, out: Table) -> Indices:
         out[...] = part.first

@@ -14,7 +14,7 @@ from tests.conftest import TINY
 
 
 class Interrupted(Exception):
-    """Ends a training in the middle, as a kill would."""
+    """Ends a training in the middle, like a kill."""
 
 
 def folder(
@@ -26,7 +26,7 @@ def folder(
 def trained(
     recipe: Recipe, dataset: Path, stop_at: int | None = None, seconds: float = 0.0
 ) -> Iterator[Snapshot]:
-    """Snapshots of the recipe's third task, with a checkpoint at every episode's border."""
+    """Snapshots of the recipe's third task, with a checkpoint at the end of every episode."""
     steps = 0
 
     def report(count: int) -> None:

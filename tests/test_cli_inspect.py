@@ -1,4 +1,4 @@
-"""`tcmrl-data inspect`: what it says of a dataset, as tables, JSON and pictures."""
+"""`tcmrl-data inspect`: descriptions of a dataset as tables, JSON and pictures."""
 
 import itertools
 import json

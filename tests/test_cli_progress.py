@@ -1,4 +1,4 @@
-"""Progress on standard error, and how durations and sizes are written."""
+"""Progress on standard error, and the format of durations and sizes."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Tables in a terminal of 80 columns and in a pipe: every number whole, every line as wide as it may be."""
+"""Tables in a terminal of 80 columns and in a pipe: complete numbers, and lines within the width."""
 
 import contextlib
 import io

@@ -1,4 +1,4 @@
-"""Methods that adapt through a context: packing, what learners may do, and what FOCAL and the control are."""
+"""Methods that adapt through a context: packing, the interface of learners, FOCAL and the control."""
 
 from dataclasses import replace
 from typing import Any
@@ -111,7 +111,7 @@ def test_focal_gathers_each_tasks_contexts() -> None:
 
 
 def test_a_learner_may_collect_and_optimise_in_its_own_way() -> None:
-    """What CSRO needs: a network trained within `losses`, kept in checkpoints, and its own first episodes."""
+    """The needs of CSRO: a network trained within `losses` and kept in checkpoints; own first episodes."""
 
     class Own(ContextLearner):
         latent = 0
@@ -138,13 +138,13 @@ def test_a_learner_may_collect_and_optimise_in_its_own_way() -> None:
     method = ContextAlgorithm(problem(), settings(), learner=Own())
     before = method.learner.inner.weight.item()
     method.update(batch(), 1)
-    assert method.learner.inner.weight.item() == pytest.approx(before - 0.1)  # one step of its own alone
+    assert method.learner.inner.weight.item() == pytest.approx(before - 0.1)  # one step of its own optimizer
     assert "optimizer/inner/weight/step" in method.tensors()
     assert not isinstance(method.explore([[], []]), UniformController)
 
 
 class Momentum(ContextLearner):
-    """Contexts that the critic alone trains, beside a momentum copy of what makes them."""
+    """Contexts that only the critic trains, with a momentum copy of their network."""
 
     latent = 2
 
@@ -178,7 +178,7 @@ class Momentum(ContextLearner):
 def test_contexts_may_be_trained_by_the_critic_step_by_step_with_a_rate_of_their_own(
     stepwise: bool, critic_gradient: bool
 ) -> None:
-    """What CORRO, PEARL and BOReL need."""
+    """The needs of CORRO, PEARL and BOReL."""
     method = ContextAlgorithm(
         problem(), settings(), learner=Momentum(stepwise=stepwise, critic_gradient=critic_gradient)
     )

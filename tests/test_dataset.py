@@ -77,7 +77,7 @@ def test_an_unknown_task_is_named(tiny: Dataset) -> None:
 
 
 def rewritten(folder: Path, **changes: object) -> None:
-    """Changes manifest fields and seals it again, as a careful forger would."""
+    """Changes manifest fields and updates the root to match."""
     values = json.loads((folder / MANIFEST).read_bytes()) | changes
     values.pop("digest")
     (folder / MANIFEST).write_bytes(seal(values))

@@ -52,7 +52,7 @@ DISCOUNTS = {3: [0.125, 0.25, 0.5], 2: [0.25, 0.5], 1: [0.5]}
 
 
 def check(steps: Steps) -> None:
-    """All four arrays of drawn steps against the tables above, and zeros on padding."""
+    """Checks all four arrays of drawn steps against the tables above, and zeros on padding."""
     returns, discounts, final, times = (getattr(steps, name) for name in FIELDS)
     assert returns.dtype == discounts.dtype == final.dtype == torch.float32 and times.dtype == torch.int64
     assert returns.shape == discounts.shape == times.shape == steps.rewards.shape

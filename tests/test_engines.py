@@ -45,7 +45,7 @@ def long_recipe() -> Recipe:
 
 @dataclass(frozen=True)
 class EngineCase:
-    """An engine to test, where it works, and the mark that its workers carry."""
+    """An engine to test, the address of its cluster if any, and the mark of its workers."""
 
     name: str
     address: str | None
@@ -144,7 +144,7 @@ def test_a_killed_worker_is_replaced_and_the_data_are_the_same(
 def test_an_error_that_a_unit_reports_is_final_and_the_others_are_done(
     engine: EngineCase, tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
 ) -> None:
-    """A file in the place of a part is nothing that another attempt could mend."""
+    """Another attempt cannot repair a file in the place of a part."""
     units = make_units(tiny_recipe, tmp_path / "data", [3, 40])
     blocked = tmp_path / "data" / part_folder(3, 100)
     blocked.write_text("in the way")
@@ -168,7 +168,7 @@ def test_a_unit_out_of_time_is_ended_and_tried_once_more(
 def test_a_crash_is_told_in_the_words_of_the_worker(
     engine: EngineCase, tiny: Dataset, tmp_path: Path
 ) -> None:
-    """A network of 400 TB is no error of the unit's own: it fails somewhere below."""
+    """A network of 400 TB fails in a library, not in a check of the unit."""
     huge = load_recipe(
         "point-robot", profile="quick", overrides=[*TINY, "behavior.sac.hidden=[10000000,10000000]"]
     )
@@ -191,7 +191,7 @@ def test_a_unit_run_twice_at_once_makes_its_data_once(
 def test_a_poison_unit_is_named_the_others_are_done_and_the_exit_code_is_1(
     engine: EngineCase, tiny_folder: Path, directions: Directions, tmp_path: Path
 ) -> None:
-    """Whoever works on task 3 is killed after its next part; what was published before stays."""
+    """Every worker of task 3 is killed after its next part; the parts published before stay."""
     out = tmp_path / "data"
     poison = replace(directions, unit="task 3", deaths=2)
     with command_line(*engine.command(out, tasks="0,3,40", workers=2), directions=poison) as driver:
@@ -221,7 +221,7 @@ def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
     with command_line(*command, "--quiet") as driver:
         wait_for(lambda: has_part(out, 0, 0) or has_part(out, 3, 0) or driver.poll() is not None, "a part")
         assert all(os.getpgid(pid) != driver.pid for pid in worker_pids(engine.mark))
-        os.killpg(driver.pid, number)  # to all of the group, as a terminal does
+        os.killpg(driver.pid, number)  # to the whole process group, as a terminal does
         _, errors = driver.communicate(timeout=PATIENCE)
     told = [line for line in errors.splitlines() if line.startswith("Error:")]
     again = shlex.join(["tcmrl-data", *command, "--quiet"])
@@ -252,7 +252,7 @@ def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
 
 
 def test_a_worker_ends_with_its_driver(long_recipe: Recipe, tmp_path: Path) -> None:
-    """That is, when its input closes, long before its unit is done."""
+    """It ends when its input closes, long before its unit is done."""
     (unit,) = make_units(long_recipe, tmp_path / "data", [40])
     command = [sys.executable, "-m", WORKER]
     worker = subprocess.run(
@@ -292,7 +292,7 @@ def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_do
 def test_a_worker_that_ends_before_it_has_read_its_spec_is_a_crash(
     program: str, error: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The worker's end is awaited before its spec is written, which then meets a closed pipe."""
+    """The spec is written after the worker has ended, so the pipe is already closed."""
     start = _attempt._start_worker
 
     def start_and_outlive(unit: Unit, errors: IO[str]) -> "subprocess.Popen[str]":
@@ -310,7 +310,7 @@ def test_a_worker_that_ends_before_it_has_read_its_spec_is_a_crash(
 def test_parts_whose_messages_are_lost_are_taken_in_all_the_same(
     tiny_recipe: Recipe, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A worker can be killed between publishing a part and telling of it."""
+    """A worker can be killed between publishing a part and reporting it."""
     local = ENGINES.get("local")
     run_and_tell = local.run
 

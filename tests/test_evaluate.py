@@ -1,4 +1,4 @@
-"""Meta-testing: scores of a run beside its controls, and `tcmrl evaluate`."""
+"""Meta-testing: scores of a run and of its controls, and `tcmrl evaluate`."""
 
 import json
 import shutil
@@ -232,7 +232,7 @@ class Plugin(Protocol):
 
 @pytest.fixture
 def foreign(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A package of somebody else with a protocol, and another that cannot be imported."""
+    """A third-party package with a protocol, and another that cannot be imported."""
     modules = {"borrowed_protocol": PLUGIN, "torn_protocol": "import no_such_module"}
     lines = "borrowed = borrowed_protocol:Plugin\ntorn = torn_protocol:Plugin"
     install(tmp_path, "foreign", modules=modules, declares={"tcmrl.protocols": lines})

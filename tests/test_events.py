@@ -29,7 +29,7 @@ def test_a_finished_build_says_so(tiny_folder: Path) -> None:
 
 
 def stop_the_clock(patch: pytest.MonkeyPatch) -> Callable[[float], None]:
-    """Makes the record's clock stand; returns what moves it to a second."""
+    """Stops the clock of the record; returns a function that sets it to a second."""
     now = [1000.0]
     patch.setattr(events.time, "time", lambda: now[0])
     return lambda second: now.__setitem__(0, 1000.0 + second)

@@ -1,4 +1,4 @@
-"""A user's package, installed as a wheel beside tcmrl's wheel into an environment of its own, at work."""
+"""A user's package, installed as a wheel together with tcmrl's wheel into a separate environment."""
 
 import json
 import os
@@ -80,7 +80,7 @@ def _run(*command: object) -> str:
 
 
 def _no_source(folder: str, names: list[str]) -> set[str]:
-    """What builds and commands leave in a tree, by .gitignore; some of it only at the top."""
+    """Files that builds and commands leave in a tree, from .gitignore; some only at the top level."""
     made = {"data", "runs", "build", "dist"} if (Path(folder) / "pyproject.toml").is_file() else set()
     return {name for name in names if name in made | {"__pycache__"} or name.startswith(".")}
 

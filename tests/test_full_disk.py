@@ -1,4 +1,4 @@
-"""Disks that are full or read-only: one line that names the file and the remedy, and nothing half-written."""
+"""Full and read-only disks: one line names the file and the remedy, and no file is incomplete."""
 
 import json
 import os

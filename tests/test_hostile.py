@@ -1,4 +1,4 @@
-"""Nothing that a stranger puts into a dataset runs, leads out of it, blocks, writes, or takes memory."""
+"""A hostile dataset cannot run code, lead out of its folder, block, write, or exhaust memory."""
 
 import contextlib
 import gc
@@ -44,7 +44,7 @@ sys.addaudithook(_note_open)
 @pytest.fixture(scope="module")
 def two_parts(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = base(tiny_folder, tmp_path_factory.mktemp("hostile") / "base")
-    look(folder)  # imports and caches are no part of any case's memory
+    look(folder)  # the memory of imports and caches is not counted
     return folder
 
 
@@ -58,7 +58,7 @@ def forge(two_parts: Path, tmp_path: Path) -> Forge:
 
 
 def look(folder: Path) -> tuple[str, str]:
-    """Opens and reads everything; the stage that refused, and what it said."""
+    """Opens and reads everything; returns the stage that refused, and its message."""
     try:
         dataset = open_dataset(folder)
     except TcmrlError as error:
@@ -84,7 +84,7 @@ def resident_bytes(field: str) -> int:
 
 @contextlib.contextmanager
 def guarded(forge: Forge) -> Iterator[None]:
-    """Fails where code ran, a path outside was opened, a file changed, memory grew, or nothing came back."""
+    """Fails if code ran, a path outside was opened, a file changed, memory grew, or a command hung."""
 
     def ring(number: int, frame: FrameType | None) -> None:
         raise AssertionError(f"blocked for {SECONDS} s")
@@ -94,7 +94,7 @@ def guarded(forge: Forge) -> Iterator[None]:
     on_disk = sum(size for _, size, _ in before.values())
     gc.collect()
     old = signal.signal(signal.SIGALRM, ring)
-    Path("/proc/self/clear_refs").write_text("5")  # starts the peak of resident memory anew
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak of resident memory
     resident = resident_bytes("VmRSS")
     opened.clear()
     limits = resource.getrlimit(resource.RLIMIT_AS)

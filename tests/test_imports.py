@@ -1,4 +1,4 @@
-"""What may import what, and what loads when: the parts of the layering that the import linter cannot see."""
+"""Layering that the import linter cannot check: lazy imports, packaging, and type checks at run time."""
 
 import ast
 import importlib

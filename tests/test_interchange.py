@@ -36,7 +36,7 @@ def assert_equal(left: Trajectory, right: Trajectory) -> None:
 
 @pytest.mark.parametrize("name", FORMATS.names())
 class TestEveryFormat:
-    """What `tcmrl-data export` relies on, whatever the format."""
+    """The guarantees that `tcmrl-data export` needs from every format."""
 
     @pytest.fixture(autouse=True)
     def library(self, name: str) -> None:
@@ -136,7 +136,7 @@ def test_hdf5_takes_a_selection_of_snapshots(tiny: Dataset, tmp_path: Path) -> N
 def test_hdf5_round_trip_of_any_episodes(
     tiny: Dataset, tmp_path_factory: pytest.TempPathFactory, episodes: list[Trajectory]
 ) -> None:
-    """Lengths 0 and 1, terminations and success flags; the same episodes stand for every part."""
+    """Lengths 0 and 1, terminations and success flags; every part has the same episodes."""
     out = tmp_path_factory.mktemp("round-trip") / "flat"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Dataset, "trajectories", lambda self, task, step: episodes)

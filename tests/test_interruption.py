@@ -1,4 +1,4 @@
-"""Ctrl-C and SIGTERM: a checkpoint, one line that says what goes on from where, and no traceback."""
+"""Ctrl-C and SIGTERM: a checkpoint, one line that says how to continue, and no traceback."""
 
 import re
 import shlex
@@ -28,7 +28,7 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
 
 @pytest.fixture
 def as_in_a_program() -> Any:
-    """Ctrl-C raises here as in any program, however the tests were started."""
+    """Ctrl-C raises KeyboardInterrupt, even if the tests run in the background."""
     earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, earlier)

@@ -1,4 +1,4 @@
-"""Losses against numbers worked out by hand, one double-precision gradient check each."""
+"""Losses against numbers computed by hand, with a double-precision gradient check for every loss."""
 
 import math
 from collections.abc import Callable

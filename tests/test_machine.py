@@ -1,4 +1,4 @@
-"""What a process may use: its CPU affinity, and quotas of control groups of both versions."""
+"""The resources of a process: its CPU affinity, and quotas of control groups of both versions."""
 
 import os
 import subprocess
@@ -13,7 +13,7 @@ from tcmrl_data.foundation.machine import available_cores, available_memory
 
 @pytest.fixture
 def groups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A file system of control groups with no group."""
+    """A file system of control groups without any group."""
     monkeypatch.setattr(machine, "CGROUPS", tmp_path / "cgroup")
     monkeypatch.setattr(machine, "OWN_CGROUPS", tmp_path / "own")
     monkeypatch.setattr(os, "sched_getaffinity", lambda process: set(range(64)))

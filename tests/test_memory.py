@@ -1,4 +1,4 @@
-"""The allocator keeps what training frees."""
+"""The allocator keeps the memory that training frees."""
 
 import platform
 import subprocess
@@ -28,7 +28,7 @@ print(given_back, faults())
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's allocator alone can be told")
 def test_freed_tensors_are_asked_for_anew_without_page_faults() -> None:
-    """In a process of its own: the setting stays."""
+    """Runs in a separate process, because the setting is permanent."""
     command = [sys.executable, "-c", COUNT_FAULTS]
     found = subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()
     given_back, kept = map(int, found)
