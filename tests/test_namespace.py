@@ -1,4 +1,4 @@
-"""Runs the tests that talk over a network in a namespace that holds the loopback alone.
+"""Runs the tests that need a network in a namespace that has only the loopback.
 
 Ray puts a machine's own address in the place of 127.0.0.1; where there is no other address, nothing that a
 test starts can be reached from outside or reach out itself.

@@ -1,4 +1,4 @@
-"""Networks: attention, masks, frozen calls, starts, and the squashed policy."""
+"""Networks: attention, masks, frozen calls, initial values, and the squashed policy."""
 
 import math
 from dataclasses import replace
@@ -161,7 +161,7 @@ def test_log_std_stays_in_range_and_keeps_its_gradient() -> None:
     log_std.sum().backward()
     assert free.grad is not None
     assert free.grad[1] > 0.8  # nearly the identity inside
-    assert free.grad[2] > 0.01  # a hard clamp would have none
+    assert free.grad[2] > 0.01  # a hard clamp has no gradient there
 
 
 def test_log_probability_is_that_of_the_squashed_action() -> None:

@@ -43,7 +43,7 @@ def test_a_group_has_its_own_rate_and_bound_and_the_common_decay() -> None:
     before = {name: layer.weight.item() for name, layer in layers.items()}
     adam.step(100.0 * (layers["slow"].weight + layers["slower"].weight).sum(), steps_done=1)
     moved = {name: before[name] - layer.weight.item() for name, layer in layers.items()}
-    assert moved == pytest.approx({"slow": 0.25, "slower": 0.5})  # Adam's first step is as long as its rate
+    assert moved == pytest.approx({"slow": 0.25, "slower": 0.5})  # a first step's length is the rate
     norms = {name: layer.weight.grad.item() for name, layer in layers.items()}
     assert norms == pytest.approx({"slow": 0.25, "slower": 2.0}, rel=1e-4)  # "slower" is not below "slow"
 

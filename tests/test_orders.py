@@ -11,7 +11,7 @@ from tcmrl_data.sampling.orders import fill_places, places_filled, read_end
 
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=4), st.data())
 def test_both_ends_belong_to_one_order_whatever_their_numbers(counts: list[int], data: st.DataObject) -> None:
-    """Without replacement within an end, disjoint between the ends, neither moved by the other's number."""
+    """Draws of an end do not repeat, the ends are disjoint, and neither depends on the other's number."""
     front = data.draw(st.integers(0, min(counts)))
     back = data.draw(st.integers(0, min(counts) - front))
     seed = data.draw(st.integers(0, 100))

@@ -1,4 +1,4 @@
-"""Plug-ins that other packages declare: found by entry points, imported one at a time, broken ones named."""
+"""Plug-ins of other packages: found by entry points, imported one at a time, errors name the plug-in."""
 
 import json
 import subprocess

@@ -1,4 +1,4 @@
-"""Making batches ahead: order, bound, errors, and the end of the thread."""
+"""Prefetching batches: order, bound, errors, and the end of the thread."""
 
 import threading
 
@@ -37,7 +37,7 @@ def test_batches_are_the_same_whatever_the_depth(depth: int) -> None:
 
 
 def test_no_more_are_made_than_the_depth_and_the_one_at_work() -> None:
-    """Those that were taken or asked for, two that wait, and one that is made and not put."""
+    """The requested batches, two in the queue, and one that waits for a place in the queue."""
     asked, ahead = 0, []
 
     def make(n: int) -> int:

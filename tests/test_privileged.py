@@ -1,4 +1,4 @@
-"""Task parameters as numbers, for controls that may see them."""
+"""Task parameters as numbers, for privileged methods."""
 
 import pytest
 import torch

@@ -74,7 +74,7 @@ def test_idaq_protocol_tries_training_contexts_and_keeps_the_best(two_tests: Dat
     training = [oracle(two_tests, task) for task in two_tests.train_tasks]
     assert len(training) == 3
     for task, adaptation in zip(two_tests.test_tasks, adaptations, strict=True):
-        # three training goals are tried, and then the goal that the best of them shows
+        # three training goals are tried, then the goal that the best of the episodes shows
         assert max(adaptation.returns[:3]) < oracle(two_tests, task) - 0.2
         assert adaptation.returns[3] == pytest.approx(oracle(two_tests, task), abs=0.05)
         assert len(adaptation.contexts) == len(adaptation.contexts[0]) == 1
@@ -82,7 +82,7 @@ def test_idaq_protocol_tries_training_contexts_and_keeps_the_best(two_tests: Dat
 
 def test_idaq_keeps_a_training_context_that_nothing_beats(two_tests: Dataset) -> None:
     class Stubborn(GoalReader):
-        """Good under the first context it sees, bad under all others."""
+        """Acts well under the first context it sees and badly under all others."""
 
         def adapt(
             self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
@@ -200,7 +200,7 @@ def test_the_prior_is_no_context_of_another_task(two_tests: Dataset) -> None:
 
 
 class Watched(GoalReader):
-    """Remembers the task parameters that it is given."""
+    """Records the task parameters that it receives."""
 
     def __init__(self) -> None:
         super().__init__()

@@ -1,4 +1,4 @@
-"""Every file operation of publishing, failed one by one; power cuts; locks. `--sweep 1` tries them all."""
+"""Publishing when single file operations fail; power cuts; locks. `--sweep 1` tests every operation."""
 
 import fcntl
 import os
@@ -40,7 +40,7 @@ def parts(tiny: Dataset, tiny_recipe: Recipe) -> PreparedParts:
 
 @pytest.fixture
 def memory() -> Iterator[Path]:
-    """A folder in memory where there is one, so that thousands of syncs take no time."""
+    """A folder in memory if the system has one, because thousands of syncs on a disk are slow."""
     shared = Path("/dev/shm")
     base = shared if os.access(shared, os.W_OK) else None
     with tempfile.TemporaryDirectory(dir=base) as folder:
@@ -49,7 +49,7 @@ def memory() -> Iterator[Path]:
 
 @pytest.fixture
 def log(parts: PreparedParts, memory: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[Path, list[Operation]]:
-    """A finished build, and every operation that made it."""
+    """A finished build, and all file operations that produced it."""
     recorder = RecordingDisk()
     (memory / "whole").mkdir()
     with pytest.MonkeyPatch.context() as patch:
@@ -59,12 +59,12 @@ def log(parts: PreparedParts, memory: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def figures(text: str) -> None:
-    """Prints what a sweep did; seen with `pytest -s`."""
+    """Prints the counts of a sweep; `pytest -s` shows them."""
     print(text)  # noqa: T201
 
 
 def expect_whole(parts: PreparedParts, tiny: Dataset, out: Path) -> None:
-    """One more build ends with every part as in the reference, and nothing in staging."""
+    """Checks that one more build ends with every part of the reference and with an empty staging folder."""
     with pytest.MonkeyPatch.context() as patch:
         report = parts.build(out, patch)
     assert report.failed == ()
@@ -99,7 +99,7 @@ def test_one_more_build_recovers_from_a_fault_at_any_operation(
 def states_after_power_cuts(
     root: Path, log: list[Operation], memory: Path, stride: int
 ) -> Iterator[tuple[str, Path]]:
-    """What power cuts after some operations leave, with unsynced names lost or kept; the last one always."""
+    """States after power cuts at every `stride`-th and last operation, with unsynced names lost or kept."""
     disk, work = PowerCut(root), memory / "cut"
     for index, operation in enumerate(log):
         disk.apply(operation)
@@ -113,7 +113,7 @@ def states_after_power_cuts(
 
 
 def flaw(out: Path, *, finished: bool, tiny: Dataset) -> str | None:
-    """What is wrong after a power cut: a torn part, a lost part that was named, or a lost build."""
+    """The flaw after a power cut: a torn part, a lost part that the manifest names, or a lost build."""
     named = set()
     if (out / "manifest.json").exists():
         try:
@@ -171,7 +171,7 @@ def test_every_sync_is_needed(tiny: Dataset, memory: Path, log: tuple[Path, list
         states = states_after_power_cuts(root, without, memory, stride=15)
         flaws = [found for place, out in states if (found := flaw(out, finished=last in place, tiny=tiny))]
         assert flaws, f"syncs of {label} could be left out"
-    figures(f"syncs of {len(kinds)} kinds of files and folders left out one by one, each found")
+    figures(f"syncs of {len(kinds)} kinds of files and folders left out one by one, every omission found")
 
 
 def test_a_full_disk_ends_in_a_clear_error_and_a_resumable_dataset(
@@ -186,7 +186,7 @@ def test_a_full_disk_ends_in_a_clear_error_and_a_resumable_dataset(
         pytest.skip(f"no tmpfs can be mounted here: {mounted.stderr.decode().strip()}")
     try:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(BuildPlan, "part_bytes", 0)  # let it start, so that it fills up
+            patch.setattr(BuildPlan, "part_bytes", 0)  # skips the check of free space
             (failure,) = parts.build(disk / "data", patch).failed
         assert "No space left on device; make room" in failure
         subprocess.run(["mount", "-o", "remount,size=10m", str(disk)], check=True)

@@ -1,4 +1,4 @@
-"""What only a cluster has: machines that are lost or too small, and a connection that may fail."""
+"""Clusters: machines that are lost or too small, and connections that fail."""
 
 import os
 import re
@@ -32,7 +32,7 @@ def ids(folder: Path, *tasks: int) -> dict[tuple[int, int], str]:
 
 @pytest.fixture
 def second_machine(ray_cluster: Any) -> Iterator[Any]:
-    """One more machine with four cores."""
+    """A second machine with four cores."""
     node = ray_cluster.add_node(num_cpus=4)
     yield node
     if node in ray_cluster.worker_nodes:
@@ -48,7 +48,7 @@ def test_a_cluster_that_loses_a_machine_ends_with_the_same_data(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Three cores a unit: one unit runs on each machine at a time, and waits after its first part."""
+    """With three cores per unit, one unit runs on every machine and waits after its first part."""
     directions = Directions(str(tmp_path / "directions")).hold()
     directions.install(monkeypatch)
     recipe = load_recipe("point-robot", profile="quick", overrides=[*TINY, "build.cpus=3"])
@@ -56,7 +56,7 @@ def test_a_cluster_that_loses_a_machine_ends_with_the_same_data(
     lost: list[int] = []
 
     def lose(event: BuildEvent) -> None:
-        """Takes the second machine down, with all its processes, while a unit runs there."""
+        """Removes the second machine, with all its processes, while a unit runs there."""
         there = [pid for pid in worker_pids(mark) if raylet.process.pid in ancestors(pid)]
         if event.kind == "part" and there and not lost:
             lost.extend(there)
@@ -80,7 +80,7 @@ def test_a_supervisor_that_is_killed_is_replaced_by_ray(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Its worker ends with it; Ray makes the same attempt again, more often than the engine tries a crash."""
+    """The worker ends with its supervisor; Ray repeats the attempt more often than the engine does."""
     out, directions = tmp_path / "data", Directions(str(tmp_path / "directions")).hold()
     directions.install(monkeypatch)
 

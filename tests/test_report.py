@@ -39,7 +39,7 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
-    """The results folder of the small experiment under one seed."""
+    """The results folder of the small experiment with one seed."""
     out = tmp_path_factory.mktemp("results") / "small"
     experiment = read_experiment(experiments.tables(tiny_folder, seeds=[0]), place="test")
     assert run_experiment(experiment, out, workers=2).failed == ()
@@ -59,7 +59,7 @@ def trained(results: Path) -> FinishedRun:
 
 
 def _with_finals(run: FinishedRun, method: str, finals: list[float]) -> list[FinishedRun]:
-    """Copies of a run as if it had been done under several seeds, with these returns."""
+    """Copies of a run, one per final return, with the seeds 0, 1 and so on."""
     document = run.result.evaluations["offline"]
     return [
         replace(

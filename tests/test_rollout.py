@@ -26,7 +26,7 @@ def roll(environment: Environment, lanes: Lanes, controller: Controller, seed: i
 
 
 class Falling(Lanes):
-    """Lane n terminates after n + 1 steps, or is truncated after 4; counts what reaches it."""
+    """Lane n terminates after n + 1 steps, or is truncated after 4; records the lanes of every step."""
 
     num_lanes = 6
 
@@ -53,7 +53,7 @@ class Falling(Lanes):
 
 
 class Recording(Controller):
-    """Asks for an action out of bounds; remembers how many lanes it saw, and every step."""
+    """Returns actions out of bounds; records the number of lanes, and every step."""
 
     def __init__(self) -> None:
         self.seen: list[int] = []
@@ -102,7 +102,7 @@ def test_the_controller_observes_every_step_as_it_was_executed(environment: Envi
 
 
 class Reconstructing(Controller):
-    """Draws actions from its noise, and records all that it is told."""
+    """Draws actions from its noise, and records every step that it observes."""
 
     def __init__(self, view: View) -> None:
         self.view = view

@@ -107,7 +107,7 @@ def test_masks_mark_the_episode_and_nothing_else(sampler: Sampler) -> None:
 
 
 def chi_square(counts: np.typing.NDArray[np.int64]) -> float:
-    """Standard deviations by which the statistic of equal shares lies above its mean."""
+    """Standard deviations by which the chi-square statistic of equal shares exceeds its mean."""
     expected = counts.sum() / counts.size
     freedom = counts.size - 1
     return float((np.square(counts - expected).sum() / expected - freedom) / np.sqrt(2 * freedom))
@@ -115,7 +115,7 @@ def chi_square(counts: np.typing.NDArray[np.int64]) -> float:
 
 @pytest.mark.parametrize("lengths", [LENGTHS, EQUAL], ids=["ragged", "equal"])
 def test_a_million_draws_are_uniform(lengths: list[list[int]]) -> None:
-    """Tasks over tasks; transitions, windows and trajectories over all valid ones of a task."""
+    """Tasks are uniform; transitions, windows and trajectories are uniform over the valid ones of a task."""
     request = BatchRequest(
         tasks=2,
         kinds={
@@ -193,7 +193,7 @@ def test_padding_holds_nothing_of_another_episode(sampler: Sampler) -> None:
 
 def test_kept_batches_are_never_overwritten_and_dropped_ones_are_used_again(sampler: Sampler) -> None:
     kept = [sampler.batch(n) for n in range(40)]
-    view = sampler.batch(40)["windows"].rewards[1]  # a part of a batch counts as much
+    view = sampler.batch(40)["windows"].rewards[1]  # parts of a batch keep it alive too
     before = [[leaf.clone() for leaf in leaves(batch)] for batch in kept], view.clone()
     for n in range(41, 141):
         sampler.batch(n)
@@ -209,7 +209,7 @@ def test_kept_batches_are_never_overwritten_and_dropped_ones_are_used_again(samp
 
 
 def test_tasks_depend_on_seed_and_number_alone(sampler: Sampler) -> None:
-    """Two samplers of one seed over the same tasks may be read side by side."""
+    """Two samplers with one seed over the same tasks, read alternately."""
     fewer = BatchRequest(tasks=3, kinds={"policy": Transitions(1)})
     other = sampler_of(numbered_tasks([[9, 2]] * 3), fewer, seed=3)
     for n in (0, 1, 17, 40):
@@ -273,7 +273,7 @@ def test_too_few_trajectories_are_named(tiny: Dataset) -> None:
 
 
 def test_no_task_parameter_is_reachable_from_a_batch(sampler: Sampler) -> None:
-    """The in-memory tasks have an index and nothing else: a sampler that asks for more fails here."""
+    """The in-memory tasks have only an index: a sampler that reads other fields fails here."""
     assert {field.name for field in dataclasses.fields(Batch)} == {"task_indices", "steps"}
     assert set(sampler.batch(0).names()) == set(REQUEST.kinds)
     assert {field.name for field in dataclasses.fields(Steps)} == {

@@ -95,7 +95,7 @@ def test_hostile_snapshots_are_refused(snapshot: Snapshot, tmp_path: Path) -> No
 
 
 def test_stored_snapshots_reproduce_the_stored_actions(tiny: Dataset) -> None:
-    """The last action of an episode follows from the stored observation, policy and keyed noise."""
+    """The stored observation, policy and keyed noise determine the last action of an episode."""
     from tcmrl_data.foundation.seeding import Purpose, keyed_generator
 
     lanes = tiny.manifest.recipe.rollouts.lanes
@@ -114,7 +114,7 @@ def test_stored_snapshots_reproduce_the_stored_actions(tiny: Dataset) -> None:
 
 
 def test_a_policy_with_other_action_bounds_is_not_imported(tmp_path: Path) -> None:
-    """Stable-Baselines3 scales to the bounds what the actor puts out; Pendulum's are -2 and 2."""
+    """Stable-Baselines3 scales the actor's output to the bounds; those of Pendulum are -2 and 2."""
     SAC("MlpPolicy", "Pendulum-v1", device="cpu", buffer_size=10).save(tmp_path / "pendulum.zip")
     with pytest.raises(SnapshotError, match=r"actions lie in \[-2, 2\], .* in \[-1, 1\]; .*RescaleAction"):
         import_sac(tmp_path / "pendulum.zip", tmp_path / "out", observation="stored")

@@ -1,4 +1,4 @@
-"""Groups of tasks trained in lockstep: streams, resuming, units, and what their snapshots are."""
+"""Groups of tasks trained in lockstep: streams, resuming, units, and snapshots."""
 
 import subprocess
 import sys
@@ -40,7 +40,7 @@ TASKS = [1, 2, 3, 5]
 
 
 class Interrupted(Exception):
-    """Ends a training in the middle, as a kill would."""
+    """Ends a training in the middle, like a kill."""
 
 
 def recipe_of(name: str = "point-robot-wind", overrides: Sequence[str] = TINY) -> Recipe:
@@ -125,7 +125,7 @@ def test_what_a_task_draws_and_learns_does_not_depend_on_its_group(tmp_path: Pat
 def test_a_resumed_training_equals_an_uninterrupted_one(
     tmp_path: Path, name: str, overrides: tuple[str, ...], stop_at: int
 ) -> None:
-    """Killed within an episode; in hopper every lane is then at another step of another episode."""
+    """Interrupted within an episode; in hopper the lanes are then at different steps and episodes."""
     recipe, tasks = recipe_of(name, overrides), [0, 2, 3]
     straight = digests(snapshots_of(recipe, context_of(recipe, tasks, tmp_path / "straight")))
     resumed: dict[tuple[int, int], str] = {}
@@ -154,7 +154,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_ids_do_not_depend_on_workers(dataset: Path, tmp_path: Path) -> None:
-    """Nor on when each group was built."""
+    """They do not depend on the order in which groups are built either."""
     for half in ([5], [1, 2, 3]):
         tcmrl_data.build_dataset(recipe_of(), tmp_path / "halves", tasks=half, workers=1)
     assert ids(tmp_path / "halves") == ids(dataset)
@@ -290,7 +290,7 @@ def test_reduced_precision_is_recorded_with_its_error_and_left_behind_at_once(tm
 
 
 def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
-    """Its own process, with checkpoints at every look at the clock; what they hold dominates."""
+    """A separate process, with a checkpoint at every check of the clock; checkpoints dominate its memory."""
     overrides = (
         "behavior.sac.hidden=[384,384]",
         "behavior.sac.steps=60",

@@ -1,4 +1,4 @@
-"""Stages of training: their order, their optimisers and schedules, and what they freeze."""
+"""Stages of training: order, optimisers, schedules, and frozen networks."""
 
 import pytest
 import torch
@@ -65,7 +65,7 @@ def test_every_stage_trains_its_parts_by_its_own_adam_and_freezes_the_others() -
         moved.append({name: before[name] - value for name, value in weights(layers).items()})
         frozen = {name for name, layer in layers.items() if not layer.weight.requires_grad}
         assert frozen == ({"b"} if step < 3 else {"a"})
-    # Adam's steps under a constant gradient are as long as its rate, which decays within every stage.
+    # Under a constant gradient, the length of Adam's steps is its rate, which decays within every stage.
     assert [found["a"] for found in moved] == pytest.approx([1.0, 0.5, 0.0, 0.0], rel=1e-4)
     assert [found["b"] for found in moved] == pytest.approx([0.0, 0.0, 1.0, 0.5], rel=1e-4)
     assert {name: sorted(adam.tensors()) for name, adam in made.adams.items()} == {

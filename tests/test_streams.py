@@ -43,7 +43,7 @@ def batch_of(kinds: dict[str, Any], n: int) -> Batch:
 def test_no_kind_changes_the_draws_of_another(
     sizes: dict[str, dict[str, Any]], order: list[str], n: int
 ) -> None:
-    """Any combination of kinds, of any size and in any order, beside the same kind among the plain ones."""
+    """Any combination of kinds, sizes and orders gives the same draws of a kind as the plain request."""
     kinds = {name: sizes[name][name] for name in order if name in sizes}
     if "context" not in kinds:
         kinds.pop("execution", None)  # it needs a partner
@@ -64,7 +64,7 @@ def test_a_kind_is_keyed_by_its_name() -> None:
 
 @pytest.mark.parametrize("numbers", [(1, 1), (2, 3), (1, 5), (5, 1)], ids=str)
 def test_apart_kinds_are_disjoint_and_uniform(numbers: tuple[int, int]) -> None:
-    """Chi-square over the 30 ordered pairs of different episodes: the last of either kind."""
+    """Chi-square over the 30 ordered pairs of different episodes, the last episodes of both kinds."""
     kinds = {"context": Trajectories(numbers[0]), "execution": Trajectories(numbers[1], apart_from="context")}
     sampler = sampler_of(numbered_tasks([[3] * 6] * 2), BatchRequest(tasks=2, kinds=kinds))
     pairs = np.zeros((6, 6), dtype=np.int64)

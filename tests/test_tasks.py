@@ -9,7 +9,7 @@ from tcmrl_data.recipe.tasks import choose_tasks, parse_indices, spread
 
 
 def test_the_split_never_moves() -> None:
-    """Recorded once: a change here silently mixes training and test tasks of published datasets."""
+    """Recorded values: a change of them mixes training and test tasks of published datasets."""
     tasks = draw_tasks(load_recipe("point-robot-wind").make_environment())
     assert [task.index for task in tasks if task.split == "test"] == [12, 15, 16, 17, 18, 19, 22, 26, 28, 44]
 

@@ -1,4 +1,4 @@
-"""TCMRL on made-up batches: who trains whom, masks, contexts, and what each switch changes."""
+"""TCMRL on synthetic batches: which loss trains which network, masks, contexts, and switches."""
 
 from dataclasses import replace
 from typing import Any
@@ -60,7 +60,7 @@ def scramble(values: Steps) -> Steps:
 
 
 def gradients(weights: dict[str, float]) -> dict[str, float]:
-    """Largest gradient of each part of the context learner under one loss term alone."""
+    """Largest gradient of every part of the context learner under a single loss term."""
     made = learner({"weights": ONLY | weights})
     losses_of(made).total.backward()  # type: ignore[no-untyped-call]
     found: dict[str, float] = {}
@@ -179,7 +179,7 @@ TERM_WEIGHTS = {"positive": 1.0, "negative": 0.5, "sparsity": 0.3, "contrastive"
 
 @pytest.mark.parametrize("name", TERM_WEIGHTS)
 def test_a_term_of_weight_zero_is_gone_and_the_others_stay(name: str) -> None:
-    """Each perspective, the contrastive and the distance-metric loss: removed, and alone."""
+    """The loss of every perspective, the contrastive and the distance-metric loss: removed, and alone."""
     whole = losses_of(learner({"weights": TERM_WEIGHTS}))
     without = losses_of(learner({"weights": TERM_WEIGHTS | {name: 0.0}}))
     alone = losses_of(learner({"weights": ONLY | {name: TERM_WEIGHTS[name]}}))
@@ -240,7 +240,7 @@ def test_k_is_the_length_of_the_windows(window_length: int) -> None:
     ],
 )
 def test_rewards_are_estimated_by_transition_or_by_trajectory(level: str, sparse: bool, whole: bool) -> None:
-    """Moving a reward along a trajectory changes the one and not the other."""
+    """Moving a reward along a trajectory changes the first and not the second."""
     made = learner({"reward_estimation": level, "weights": ONLY | {"positive": 1.0}}, sparse=sparse)
     assert made.estimates_trajectories is whole
     plain = batch(lengths=None)

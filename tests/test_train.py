@@ -114,7 +114,7 @@ def test_unknown_algorithm_names_the_nearest(tiny: Dataset) -> None:
 @pytest.mark.parametrize("algorithm", METHODS.names())
 def test_one_seed_gives_the_same_parameters_after_100_steps(start: Train, algorithm: str) -> None:
     first = start("first", algorithm=algorithm, steps=100, seed=3)
-    torch.manual_seed(12345)  # the global state plays no part
+    torch.manual_seed(12345)  # the global state has no influence
     second = start("second", algorithm=algorithm, steps=100, seed=3)
     assert first.digest == second.digest
     assert start("third", algorithm=algorithm, steps=100, seed=4).digest != first.digest
@@ -157,7 +157,7 @@ def test_a_run_killed_between_checkpoints_resumes_from_the_last(
     resumed = resume_run(killed.folder, tiny)
     straight = start("straight", steps=60)
     assert resumed.digest == straight.digest
-    assert _metrics(killed.folder) == _metrics(straight.run.folder)  # what was logged beyond 25 is dropped
+    assert _metrics(killed.folder) == _metrics(straight.run.folder)  # lines after step 25 are dropped
 
 
 def _metrics(folder: Path) -> list[dict[str, float]]:

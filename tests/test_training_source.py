@@ -1,4 +1,4 @@
-"""Where a method's own settings come from: the dataset's manifest, the installed recipe, its defaults."""
+"""Sources of a method's own settings: the dataset's manifest, the installed recipe, its defaults."""
 
 import json
 from collections.abc import Callable

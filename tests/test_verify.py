@@ -1,4 +1,4 @@
-"""Whatever changes in a dataset is found by name; repaired parts keep their ids; gc takes only the dead."""
+"""Verification names every changed file; repaired parts keep their ids; gc removes only unused files."""
 
 import itertools
 import json
@@ -34,7 +34,7 @@ Copy = Callable[[], Path]
 
 @pytest.fixture(scope="module")
 def sound(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two parts of the tiny dataset, whose every damage below is undone again."""
+    """Two parts of the tiny dataset; every test restores them after damaging them."""
     return base(tiny_folder, tmp_path_factory.mktemp("rot") / "dataset")
 
 
@@ -74,7 +74,7 @@ Rot = Callable[[bytes, random.Random], bytes | None]
 
 
 def rot_everywhere(folder: Path, rot: Rot, *, rounds: int) -> int:
-    """Damages every file in turn; each time verification names that file alone. Returns the cases."""
+    """Damages every file in turn; verification must name only that file. Returns the number of cases."""
     chance, cases = random.Random(0), 0
     for file in data_files(folder):
         good = file.read_bytes()
@@ -126,7 +126,7 @@ def test_every_swap_of_two_files_that_differ_is_found(sound: Path) -> None:
         cases += 1
         names = found(sound)
         for file, other in ((left, right), (right, left)):
-            # beside a foreign record, nobody knows what the files of its part must be
+            # a foreign record does not state the digests of its part's files
             is_hidden = other.name == "part.json" and other.parent in file.parents
             assert is_hidden or str(file.relative_to(sound)) in names
         left.write_bytes(first)
@@ -146,7 +146,7 @@ def test_work_files_are_no_data(sound: Path) -> None:
 
 
 def test_levels_look_ever_closer(forge: Forge) -> None:
-    """A flipped bit is for the digests, forged values are for the deep look."""
+    """Digests find a flipped bit; only the deep level finds forged values."""
     file = forge.part / "rewards/c/0"
     file.write_bytes(file.read_bytes()[:-1] + bytes([file.read_bytes()[-1] ^ 1]))
     assert verify_dataset(forge.folder, level="quick").findings == ()
@@ -158,7 +158,7 @@ def test_levels_look_ever_closer(forge: Forge) -> None:
 
 
 def reencoded(forge: Forge, name: str, change: Callable[[np.ndarray], object]) -> None:  # type: ignore[type-arg]
-    """An array with other values, every digest made to fit."""
+    """Replaces an array's values and updates every digest to match."""
     array = open_dataset(forge.folder).arrays(0, STEP)[name].copy()
     change(array)
     forge.write(f"{name}/c/{'0/0' if array.ndim == 2 else '0'}", first_chunk(name, array))
@@ -322,7 +322,7 @@ def test_a_damaged_manifest_is_recovered_by_building_again(tiny_copy: Copy, tiny
 
 
 def littered(folder: Path) -> set[str]:
-    """What killed builds leave behind; returns what gc must take."""
+    """Creates the files that killed builds leave behind; returns those that gc must remove."""
     staging = folder / STAGING
     (staging / "task_00003.dead").mkdir(parents=True)
     (staging / "task_00003.dead/x").write_bytes(b"12345")
@@ -432,7 +432,7 @@ def test_a_dataset_in_use_cannot_be_repaired(tiny_copy: Copy) -> None:
 
 
 def test_a_replay_needs_no_behavior_source(tiny_copy: Copy) -> None:
-    """A part's policy lies in the part: the package that trained it need not be installed."""
+    """A part contains its policy, so the package that trained it need not be installed."""
     folder = tiny_copy()
     manifest = read_manifest(folder)
     behavior = manifest.recipe.behavior.model_copy(update={"source": "not-installed"})

@@ -1,4 +1,4 @@
-"""Processes of builds: finding them from outside, which Linux tells by /proc, and starting them."""
+"""Processes of builds: finding them through Linux's /proc, and starting them."""
 
 import contextlib
 import os
@@ -25,13 +25,13 @@ def worker_pids(mark: str) -> list[int]:
 
 
 def _module(pid: int) -> bytes:
-    """The module that a process was started with, by `python -m`."""
+    """The module that `python -m` started the process with."""
     _, _, module = (*_read(pid, "cmdline").split(b"\0"), b"", b"", b"")[:3]
     return module
 
 
 def marked_pids(mark: str) -> list[int]:
-    """Live processes that inherited a mark in their environment, this one's children and theirs."""
+    """Live processes that inherited a mark in their environment: children of this one, and their children."""
     wanted = f"{MARK}={mark}".encode()
     pids = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
     return [pid for pid in pids if wanted in _read(pid, "environ").split(b"\0")]
@@ -48,7 +48,7 @@ def ancestors(pid: int) -> list[int]:
 
 
 def wait_for(condition: Callable[[], object], what: str) -> None:
-    """Waits until something is so; the deadline only ends what would hang."""
+    """Waits until a condition holds; the deadline only ends a wait that would never end."""
     deadline = time.monotonic() + PATIENCE
     while not condition():
         assert time.monotonic() < deadline, f"{what}: not within {PATIENCE:g} s"
@@ -62,15 +62,15 @@ def command_line(
     directions: "Directions | None" = None,
     mark: str | None = None,
 ) -> Iterator["subprocess.Popen[str]"]:
-    """A running `tcmrl-data` or `tcmrl` in a session of its own, killed at the end if it still runs.
+    """A running `tcmrl-data` or `tcmrl` in a separate session, killed at the end if it still runs.
 
-    It hears Ctrl-C even where the tests themselves run in the background of a shell, which ignores it.
+    It receives Ctrl-C even if the tests run in the background of a shell, where Ctrl-C is ignored.
 
     Args:
         arguments: what follows the program's name.
         program: `tcmrl-data` or `tcmrl`.
         directions: for the workers that it starts.
-        mark: stands in the environment of its processes instead of the session's.
+        mark: replaces the session's mark in the environment of its processes.
     """
     code = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     code += f"from tcmrl_cli.{'data' if program == 'tcmrl-data' else 'train'} import main\n"
