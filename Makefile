@@ -1,5 +1,5 @@
 # make demo   the whole main job on a small environment, from nothing
-# make test   the tests
+# make test   the tests, but for the sweeps that take minutes
 # make check  what continuous integration runs
 PYTHON ?= python3
 SEED ?= 0
@@ -38,7 +38,7 @@ demo: $(INSTALLED)
 	@echo "Next: $(BIN)/tcmrl experiment tour --data $(DATA)"
 
 test: $(INSTALLED_TEST)
-	$(BIN)/python -m pytest -n $(JOBS)
+	$(BIN)/python -m pytest -n $(JOBS) -m "not sweep"
 
 check: $(INSTALLED_TEST)
 	$(BIN)/ruff check .

@@ -1,7 +1,10 @@
+import pytest
+
 from tests.conftest import TINY
 from tests.kill_sweep import run_sweep
 
 
+@pytest.mark.sweep
 def test_killed_builds_lose_nothing_and_leave_nobody_behind() -> None:
     """Twenty kills; `python -m tests.kill_sweep` does two hundred on the quick profile itself."""
     arguments = ["--tasks", "0,5,12,15,20,30", *(word for override in TINY for word in ("--set", override))]

@@ -20,7 +20,7 @@ LEAST = 15
 """As many tests at least are marked `loopback`; fewer would mean that they were lost on the way."""
 
 
-@pytest.mark.slow
+@pytest.mark.sweep
 def test_what_needs_a_network_holds_in_a_namespace_of_its_own(tiny_folder: Path) -> None:
     if has_only_loopback():
         pytest.skip("this machine has the loopback alone, so those tests run directly")

@@ -289,6 +289,7 @@ def test_reduced_precision_is_recorded_with_its_error_and_left_behind_at_once(tm
     assert {torch.get_float32_matmul_precision() for _ in snapshots} == {"highest"}
 
 
+@pytest.mark.sweep
 def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
     """A separate process, with a checkpoint at every check of the clock; checkpoints dominate its memory."""
     overrides = (

@@ -94,6 +94,7 @@ def test_every_damaged_file_is_found_and_no_other(sound: Path, rot: Rot, rounds:
     assert rot_everywhere(sound, rot, rounds=rounds) == 39 * rounds
 
 
+@pytest.mark.sweep
 def test_one_flipped_bit_is_found_in_any_file_of_many_parts(tiny_copy: Copy) -> None:
     assert rot_everywhere(tiny_copy(), flip, rounds=1) >= 250
 
