@@ -53,9 +53,8 @@ def main_program(command: click.Command) -> NoReturn:
             raise KeyboardInterrupt
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        if (
-            signal.getsignal(number) != signal.SIG_IGN
-        ):  # a shell ignores the signal for background jobs: keep that
+        # A shell ignores these signals for background jobs; that must stay so.
+        if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, interrupt)
     try:
         code = run(command)
