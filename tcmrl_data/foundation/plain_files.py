@@ -3,6 +3,7 @@
 import os
 import stat
 from pathlib import Path
+from typing import BinaryIO
 
 KINDS = {
     stat.S_IFLNK: "a link",
@@ -41,12 +42,25 @@ def read_plain_file(file: Path, *, limit: int) -> bytes:
         ValueError: not a regular file, or larger than the limit; the message does not name the file.
         OSError: the file is missing or cannot be read.
     """
+    with open_plain_file(file, limit=limit) as opened:
+        return opened.read(min(limit, os.fstat(opened.fileno()).st_size))
+
+
+def open_plain_file(file: Path, *, limit: int) -> BinaryIO:
+    """Opens a regular file for reading, under the conditions of `read_plain_file`.
+
+    Raises:
+        ValueError: not a regular file, or larger than the limit; the message does not name the file.
+        OSError: the file is missing or cannot be opened.
+    """
     _require_plain(os.lstat(file), limit)
     descriptor = os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    with os.fdopen(descriptor, "rb") as opened:
-        status = os.fstat(descriptor)
-        _require_plain(status, limit)
-        return opened.read(status.st_size)
+    try:
+        _require_plain(os.fstat(descriptor), limit)
+    except ValueError:
+        os.close(descriptor)
+        raise
+    return os.fdopen(descriptor, "rb")
 
 
 def folder_problem(root: Path, folder: str) -> tuple[str, str] | None:
