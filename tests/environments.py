@@ -11,6 +11,7 @@ from tcmrl_data import load_recipe
 from tcmrl_data.envs.base import Environment, Parameters
 from tcmrl_data.envs.controller import Controller
 from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.tasks import draw_tasks
 from tcmrl_data.envs.trajectory import Trajectory
 
 ML1_IN_FULL = ("ml1/reach", "ml1/door-close", "ml1/stick-pull")
@@ -32,8 +33,7 @@ def environment_of(name: str, *overrides: str) -> Environment:
 @functools.cache
 def parameters_of(name: str) -> tuple[dict[str, Any], ...]:
     """Task parameters; cached because ML1 takes a second to draw them."""
-    settings = environment_of(name).settings
-    return tuple(environment_of(name).draw_parameters(settings.tasks, settings.task_seed))
+    return tuple(dict(task.parameters) for task in draw_tasks(environment_of(name)))
 
 
 def actions_of(environment: Environment, seed: int = 0, steps: int = STEPS) -> np.ndarray:

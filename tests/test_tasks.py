@@ -1,17 +1,90 @@
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tcmrl_data import load_recipe
-from tcmrl_data.envs.tasks import Task, draw_tasks
+from tcmrl_data.envs.base import ENVIRONMENTS
+from tcmrl_data.envs.tasks import PARAMETER_DIGITS, Task, draw_tasks
 from tcmrl_data.foundation.errors import TaskError
 from tcmrl_data.recipe.tasks import choose_tasks, parse_indices, spread
+from tests.environments import environment_of, parameters_of, some_members
+from tests.platforms import OTHER_PLATFORMS
+
+ALL_NAMES = [name for family in ENVIRONMENTS.working().values() for name in family.members()]
+NAMES = [name for family in ENVIRONMENTS.working().values() for name in some_members(family)]
+
+DRAW = """
+import json, sys
+from tcmrl_data import load_recipe
+from tcmrl_data.envs.tasks import draw_tasks
+for name in sys.argv[1:]:
+    tasks = draw_tasks(load_recipe(name).make_environment())
+    print(json.dumps([[task.index, task.split, task.parameters] for task in tasks]))
+"""
 
 
 def test_the_split_never_moves() -> None:
     """Recorded values: a change of them mixes training and test tasks of published datasets."""
     tasks = draw_tasks(load_recipe("point-robot-wind").make_environment())
     assert [task.index for task in tasks if task.split == "test"] == [12, 15, 16, 17, 18, 19, 22, 26, 28, 44]
+
+
+def drawn_elsewhere(names: list[str], variables: dict[str, str]) -> list[Any]:
+    """The tasks of environments, drawn by a process with other instruction sets."""
+    done = subprocess.run(
+        [sys.executable, "-c", DRAW, *names],
+        env=os.environ | variables,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return [json.loads(line) for line in done.stdout.splitlines()]
+
+
+def assert_equal_elsewhere(names: list[str], variables: dict[str, str]) -> None:
+    for name, elsewhere in zip(names, drawn_elsewhere(names, variables), strict=True):
+        here = [[task.index, task.split, task.parameters] for task in draw_tasks(environment_of(name))]
+        assert elsewhere == here, name
+
+
+@pytest.mark.parametrize("platform", OTHER_PLATFORMS)
+def test_tasks_are_the_same_bits_on_every_instruction_set(platform: str) -> None:
+    assert_equal_elsewhere(NAMES, OTHER_PLATFORMS[platform])
+
+
+@pytest.mark.sweep
+@pytest.mark.parametrize("platform", OTHER_PLATFORMS)
+def test_all_tasks_are_the_same_bits_on_every_instruction_set(platform: str) -> None:
+    assert_equal_elsewhere(ALL_NAMES, OTHER_PLATFORMS[platform])
+
+
+def numbers(value: Any) -> Iterator[float]:
+    """All floats within JSON values."""
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, dict | list):
+        for member in value.values() if isinstance(value, dict) else value:
+            yield from numbers(member)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_task_of_a_recipe_lies_where_rounding_could_tip(name: str) -> None:
+    """A last digit that differs on another processor changes no parameter: none is close to half a digit."""
+    environment = environment_of(name)
+    drawn = environment.draw_parameters(environment.settings.tasks, environment.settings.task_seed)
+    values = np.array(list(numbers(drawn)))
+    for error in (-4, 4):  # in units of the last binary digit
+        moved = values * (1 + error * np.finfo(np.float64).eps)
+        rounded = [float(f"{value:.{PARAMETER_DIGITS}g}") for value in moved]
+        assert rounded == list(numbers(list(parameters_of(name))))
 
 
 @given(st.integers(2, 20), st.integers(1, 10))

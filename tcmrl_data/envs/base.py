@@ -126,7 +126,11 @@ class Environment(abc.ABC):
 
     @abc.abstractmethod
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
-        """Draws the parameters of all tasks as the published code does; JSON values."""
+        """Draws the parameters of all tasks as the published code does; JSON values.
+
+        `draw_tasks` rounds floats to ten significant digits. Python's `math` is better than NumPy's functions
+        of arrays, whose last digits depend on the processor's instruction set.
+        """
 
     @abc.abstractmethod
     def make(

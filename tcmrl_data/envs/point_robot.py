@@ -4,6 +4,7 @@ The definitions follow the published code of PEARL, FOCAL and IDAQ. The robot st
 action moves it by at most 0.1 per axis.
 """
 
+import math
 from collections.abc import Sequence
 from typing import Any, Literal, final
 
@@ -100,7 +101,7 @@ class PointRobotWind(_PointRobot):
 def half_circle_goals(num_tasks: int) -> list[dict[str, Any]]:
     """Goals (cos a, sin a) at angles linspace(0, pi, num_tasks), without wind."""
     angles = np.linspace(0.0, np.pi, num_tasks)
-    return [{"goal": [float(np.cos(a)), float(np.sin(a))], "wind": [0.0, 0.0]} for a in angles]
+    return [{"goal": [math.cos(angle), math.sin(angle)], "wind": [0.0, 0.0]} for angle in angles]
 
 
 def goals_and_winds(parameters: Sequence[Parameters]) -> tuple[FloatArray, FloatArray]:

@@ -13,6 +13,7 @@ have friction 1.9). Two settings concern differences from the older models of th
 """
 
 import abc
+import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, final
 
@@ -65,7 +66,10 @@ class _RandParams(Environment):
         multipliers: dict[str, Any] = {}
         for name, shape in self.shapes.items():
             base = settings.damping_base if name == "dof_damping" else settings.multiplier_base
-            multipliers[name] = (base ** random.uniform(-limit, limit, shape)).tolist()
+            exponents = random.uniform(-limit, limit, shape)
+            # NumPy's power of an array rounds differently with AVX-512
+            powers = [math.pow(base, exponent) for exponent in exponents.ravel()]
+            multipliers[name] = np.reshape(powers, shape).tolist()
         return multipliers
 
     def make(

@@ -17,7 +17,7 @@ from tcmrl_data.recipe.recipe import Recipe
 SCHEMA_VERSION = 1
 """Raised when the meaning or the layout of a dataset's files changes."""
 
-DATA_VERSION = 1
+DATA_VERSION = 2
 """Raised by hand when the code's data change for the same recipe and seed."""
 
 MANIFEST = "manifest.json"
