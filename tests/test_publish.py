@@ -1,6 +1,5 @@
 """Publishing when single file operations fail; power cuts; locks. `--sweep 1` tests every operation."""
 
-import fcntl
 import os
 import re
 import shutil
@@ -243,31 +242,6 @@ def test_gc_never_removes_a_live_attempt(tmp_path: Path) -> None:
         assert sorted(path.name for path in staging.iterdir()) == ["live.1", "live.1.lock"]
         holder.kill()
     assert remove_abandoned(tmp_path) == ["live.1"]
-
-
-def test_a_look_at_the_lock_delays_a_writer_and_does_not_refuse_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lock = tmp_path / LOCK
-    lock.touch()
-    with lock.open("rb") as reader:
-        fcntl.flock(reader, fcntl.LOCK_SH)
-        monkeypatch.setattr("time.sleep", lambda seconds: fcntl.flock(reader, fcntl.LOCK_UN))
-        with lock_file(lock, "dataset"):
-            assert lock_holder(lock) == f"process {os.getpid()} on {os.uname().nodename}"
-
-
-def test_a_reader_that_keeps_the_lock_is_not_waited_for_without_end(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lock, waits = tmp_path / LOCK, list[float]()
-    lock.touch()
-    monkeypatch.setattr("time.sleep", waits.append)
-    with lock.open("rb") as reader:
-        fcntl.flock(reader, fcntl.LOCK_SH)
-        with pytest.raises(LockedError, match="another process"), lock_file(lock, "dataset"):
-            pass
-    assert 0.5 < sum(waits) < 10
 
 
 def test_two_builders_at_once_one_works_the_other_is_refused(

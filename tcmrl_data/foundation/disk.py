@@ -6,21 +6,17 @@ import fcntl
 import os
 import shutil
 import tempfile
-import time
 import uuid
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any, TextIO
 
 from tcmrl_data.foundation.errors import LockedError, ReadOnlyError, StorageError
+from tcmrl_data.foundation.locks import is_locked, try_exclusive_lock
 
 STAGING = ".staging"
 LOCK = ".lock"
 CHECKPOINTS = ".checkpoints"
-
-PROBE_ATTEMPTS = 100
-PROBE_SECONDS = 0.02
-"""A writer retries this often, at this interval, while `lock_holder` looks at the lock."""
 
 GO_ON = "make room on the disk or repair it, then run the same command again to continue"
 
@@ -215,29 +211,17 @@ def lock_file(path: Path, what: str) -> Iterator[Path]:
     Raises:
         LockedError: another process holds the lock; the message names that process.
         ReadOnlyError: the folder cannot be written.
+        StorageError: the file system has no locks.
     """
     with _open_lock(path) as file:
-        if not _lock_for_writing(file):
+        with named_errors(path, remedy="choose a folder on a file system with locks"):
+            is_ours = try_exclusive_lock(file)
+        if not is_ours:
             raise LockedError(f"{what} is being written by {_holder(path)}; wait for it or stop it")
         file.truncate(0)
         file.write(f"process {os.getpid()} on {os.uname().nodename}")
         file.flush()
         yield path
-
-
-def _lock_for_writing(file: TextIO) -> bool:
-    """Takes the exclusive lock; returns False at once if another writer holds it.
-
-    `lock_holder` takes a shared lock briefly. A shared lock is no reason to refuse, so it is waited for.
-    """
-    for _ in range(PROBE_ATTEMPTS):
-        if try_lock(file, fcntl.LOCK_EX):
-            return True
-        if not try_lock(file, fcntl.LOCK_SH):
-            return False
-        fcntl.flock(file, fcntl.LOCK_UN)
-        time.sleep(PROBE_SECONDS)
-    return False
 
 
 def try_lock(file: IO[Any], kind: int) -> bool:
@@ -266,11 +250,17 @@ def _open_lock(path: Path) -> TextIO:
 
 
 def lock_holder(path: Path) -> str | None:
-    """The process that holds an exclusive lock, or None if no process does; the file may be read-only."""
+    """The process that holds the lock of `lock_file`, or None if no process does.
+
+    Asking takes no lock, so that it may be done at any time; the file may be read-only.
+    """
     if not path.is_file():
         return None
-    with path.open("rb") as file:
-        return None if try_lock(file, fcntl.LOCK_SH) else _holder(path)
+    try:
+        with path.open("rb") as file:
+            return _holder(path) if is_locked(file) else None
+    except FileNotFoundError:  # removed meanwhile
+        return None
 
 
 def _holder(path: Path) -> str:
