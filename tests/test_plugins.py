@@ -13,6 +13,7 @@ from tcmrl_data import list_environments, load_recipe
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import PluginError, UnknownNameError
 from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.store.platform import this_platform
 from tests.commands import assert_refused, in_process
 from tests.plugin_packages import install
 
@@ -200,6 +201,13 @@ def test_an_environment_of_another_package_brings_its_recipe(site: Path, pole_re
         load_recipe("pole/lang")
     with pytest.raises(UnknownNameError, match="unknown environment 'pole'; did you mean pole/"):
         load_recipe("pole")
+
+
+def test_the_package_of_a_plugin_is_part_of_the_platform(site: Path, pole_recipe: str) -> None:
+    (site / "pole.toml").write_text(pole_recipe)
+    environment = load_recipe("pole/long", profile="quick").make_environment()
+    assert this_platform(environment, "sac").packages["users-package"] == "1.0"
+    assert "tcmrl" not in this_platform(environment, "sac").packages
 
 
 def test_envs_lists_broken_environments_with_their_errors_beside_all_others(

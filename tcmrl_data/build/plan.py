@@ -9,6 +9,7 @@ from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.recipe.tasks import choose_tasks, group_tasks, pick_tasks
+from tcmrl_data.store.platform import Platform, this_platform
 
 PROCESS_BYTES = 400 * 2**20
 """A worker beside its data: torch, MuJoCo and Zarr take about 310 MB as measured; the rest is margin."""
@@ -58,6 +59,11 @@ class BuildPlan:
     def groups(self) -> tuple[tuple[Task, ...], ...]:
         """The tasks, those of one unit together."""
         return tuple(group_tasks(self.tasks, self.source.group_size))
+
+    @functools.cached_property
+    def platform(self) -> Platform:
+        """The platform of this process for the plan's environment and behavior source."""
+        return this_platform(self.environment, self.recipe.behavior.source)
 
     @property
     def part_bytes(self) -> int:

@@ -61,6 +61,11 @@ class Registry(Generic[Kind]):
         plugin: type[Kind] = found
         return plugin
 
+    def provider(self, name: str) -> str | None:
+        """The distribution that declares a plug-in; None if no installed one does."""
+        distributions = [entry.dist for entry in self._entries().get(name, []) if entry.dist]
+        return distributions[0].name if distributions else None
+
     def working(self) -> dict[str, type[Kind]]:
         """The class of every working plug-in, by name; imports all plug-ins of this kind."""
         return self._load_all()[0]
