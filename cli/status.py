@@ -49,4 +49,6 @@ def status(dataset: Path, as_json: bool, quiet: bool) -> None:
         table.add_row(name, printable(value))
     for failure in found.failed:
         table.add_row("failed", printable(failure))
+    if found.num_failed > len(found.failed):
+        table.add_row("failed", f"{found.num_failed:,} units; these are the latest {len(found.failed):,}")
     print_table(table)

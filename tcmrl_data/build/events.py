@@ -1,29 +1,34 @@
-"""The record of a build: `events.jsonl` in the dataset, written as it goes on, read by anyone at any time."""
+"""The record of a build: `events.jsonl` in the dataset, written as it goes on, read by anyone at any time.
+
+The record is two files of at most EVENTS_BYTES each. When `events.jsonl` is full it becomes `events.1.jsonl`,
+the earlier one goes, and a new one begins with a line of kind `rotated` that sums up the latest build so far.
+A status therefore needs `events.jsonl` alone, and never reads more than EVENTS_BYTES.
+"""
 
 import dataclasses
 import json
 import os
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tcmrl_data.foundation.disk import LOCK, lock_holder, named_errors
-from tcmrl_data.store.manifest import dataset_folder, read_manifest
+from tcmrl_data.build.history import History, is_number, is_summary
+from tcmrl_data.foundation.disk import LOCK, STAGING, lock_holder, move_into_place, named_errors, replace_file
+from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.store.manifest import Manifest, dataset_folder, read_manifest
 
 EVENTS = "events.jsonl"
+EARLIER_EVENTS = "events.1.jsonl"
+EVENTS_BYTES = 2 * 2**20
+"""Maximum size of each of the two files; both together hold about four hours of building."""
+
 STEPS_SECONDS = 1.0
 """Progress within a unit is recorded at most this often."""
 
-TAIL_BYTES = 2**20
-"""A reader takes every event of the record's end, and before it only how builds began and units ended."""
-
-RECORD_BYTES = 2**30
-"""A reader looks at no more than this; a day of building writes about 30 MB."""
-
-LINE_BYTES = 2**16
-MILESTONES = tuple(f'"kind": "{kind}"'.encode() for kind in ("start", "unit_done", "unit_failed"))
+MESSAGE_CHARACTERS = 1_000
+"""A longer message is cut in the record."""
 
 EventKind = Literal["start", "steps", "part", "unit_done", "unit_failed", "end"]
 
@@ -50,6 +55,12 @@ class BuildEvent:
     message: str
 
 
+TEXTS = frozenset({"kind", "message", "unit"})
+NUMBERS = frozenset({"time", "process", *(field.name for field in dataclasses.fields(BuildEvent))}) - TEXTS
+FIELDS = NUMBERS | TEXTS
+"""Of a line of the record."""
+
+
 class EventLog:
     """Appends events to a dataset's record and passes them on; a context manager.
 
@@ -58,25 +69,58 @@ class EventLog:
     """
 
     def __init__(self, dataset: Path, progress: Callable[[BuildEvent], None]) -> None:
-        self._progress, self._path = progress, dataset / EVENTS
+        self._progress, self._dataset, self._path = progress, dataset, dataset / EVENTS
         self._steps_written = 0.0
+        self._history = History()
 
     def __enter__(self) -> "EventLog":
-        self._file = os.open(self._path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+        self._open()
         return self
 
     def __exit__(self, *exception: object) -> None:
         os.close(self._file)
 
     def write(self, event: BuildEvent) -> None:
-        """Records an event and reports it."""
+        """Records an event and reports it.
+
+        Raises:
+            StorageError: the operating system refuses the operation.
+        """
         now = time.time()
         if event.kind != "steps" or now - self._steps_written >= STEPS_SECONDS:
             line = {"time": round(now, 3), "process": os.getpid(), **dataclasses.asdict(event)}
-            with named_errors(self._path):
-                os.write(self._file, json.dumps(line).encode() + b"\n")
+            line["message"] = event.message[:MESSAGE_CHARACTERS]
+            self._append(line)
             self._steps_written = now if event.kind == "steps" else self._steps_written
         self._progress(event)
+
+    def _append(self, line: Mapping[str, Any]) -> None:
+        data = _encode(line)
+        if self._size and self._size + len(data) > EVENTS_BYTES:
+            self._rotate()
+        with named_errors(self._path):
+            os.write(self._file, data)
+        self._size += len(data)
+        self._history.add(line)
+
+    def _rotate(self) -> None:
+        """Starts a new file; a reader that finds none meanwhile takes the earlier one."""
+        full, summary = self._file, self._history.summary()
+        if self._path.exists():  # not if an earlier attempt failed in between
+            move_into_place(self._path, self._dataset / EARLIER_EVENTS)
+        replace_file(self._path, _encode(summary) if summary else b"", staging=self._dataset / STAGING)
+        self._open()
+        os.close(full)
+
+    def _open(self) -> None:
+        self._file = os.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o644)
+        self._size = os.fstat(self._file).st_size
+        if self._size and os.pread(self._file, 1, self._size - 1) != b"\n":
+            self._size += os.write(self._file, b"\n")  # a process ended, or the disk was full, within a line
+
+
+def _encode(line: Mapping[str, Any]) -> bytes:
+    return json.dumps(line).encode() + b"\n"
 
 
 @dataclass(frozen=True)
@@ -86,7 +130,8 @@ class BuildStatus:
     Attributes:
         builder: the process that builds it now; null where none does.
         running: units at work, as far as the record tells.
-        failed: one line per unit that failed in the latest build.
+        failed: one line per unit that failed in the latest build, the latest 100.
+        num_failed: units that failed in the latest build.
         steps_per_second: environment steps of behavior training, over the latest minute of the record.
         seconds_left: at that rate; null where nothing is known.
         updated: Unix time of the latest event.
@@ -101,6 +146,7 @@ class BuildStatus:
     builder: str | None
     running: tuple[str, ...]
     failed: tuple[str, ...]
+    num_failed: int
     steps_per_second: float | None
     seconds_left: float | None
     updated: float | None
@@ -115,77 +161,68 @@ def build_status(dataset: Path) -> BuildStatus:
     folder = dataset_folder(dataset)
     manifest = read_manifest(folder)
     builder = lock_holder(folder / LOCK)
-    events = _latest_build(folder / EVENTS)
-    rate = _rate(events)
-    last = events[-1] if events else None
-    left = (last["steps_total"] - last["steps_done"]) / rate if last and rate and builder else None
+    history = _latest_build(folder)
+    tasks, parts_done, parts_total = _counts(manifest)
+    last = history.last
+    if builder and last and last["parts_total"] == parts_total:
+        parts_done = max(parts_done, last["parts_done"])  # the manifest may be behind a running build
+    rate = history.steps_per_second if builder else None
     return BuildStatus(
         dataset=str(folder),
         environment=manifest.name,
         complete=manifest.complete,
-        tasks=len(manifest.tasks),
-        parts_done=len(manifest.parts),
-        parts_total=len(manifest.tasks) * len(manifest.steps),
+        tasks=tasks,
+        parts_done=parts_done,
+        parts_total=parts_total,
         builder=builder,
-        running=_running(events) if builder else (),
-        failed=tuple(event["message"] for event in events if event["kind"] == "unit_failed"),
-        steps_per_second=rate if builder else None,
-        seconds_left=left,
+        running=tuple(history.running) if builder else (),
+        failed=tuple(history.failed),
+        num_failed=history.num_failed,
+        steps_per_second=rate,
+        seconds_left=(last["steps_total"] - last["steps_done"]) / rate if last and rate else None,
         updated=last["time"] if last else None,
     )
 
 
-def _latest_build(path: Path) -> list[dict[str, Any]]:
-    """Events since the last `start`; lines that are no events are passed over."""
-    fields = {field.name for field in dataclasses.fields(BuildEvent)} | {"time", "process"}
-    events: list[dict[str, Any]] = []
-    for line in _lines(path):
+def _counts(manifest: Manifest) -> tuple[int, int, int]:
+    """Numbers of the tasks, the published parts and the wanted parts."""
+    return len(manifest.tasks), len(manifest.parts), len(manifest.tasks) * len(manifest.steps)
+
+
+def _latest_build(folder: Path) -> History:
+    """What the record tells of the latest build; lines that are no events are passed over."""
+    history = History()
+    for line in _lines(folder):
         try:
             event = json.loads(line)
         except (ValueError, RecursionError):
             continue
-        if isinstance(event, dict) and set(event) == fields and _is_well_typed(event):
-            if event["kind"] == "start":
-                events.clear()
-            events.append(event)
-    return events
+        if _is_event(event):
+            history.add(event)
+    return history
 
 
-def _lines(path: Path) -> Iterator[bytes]:
-    """The last lines of the record, and before them those that tell of milestones."""
-    if not path.is_file() or path.is_symlink():
-        return
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        file.seek(max(0, size - RECORD_BYTES))
-        while line := file.readline(LINE_BYTES):
-            if file.tell() > size - TAIL_BYTES or any(mark in line for mark in MILESTONES):
-                yield line
+def _lines(folder: Path) -> list[bytes]:
+    """The lines of the record; of the earlier file only while a new one is being made."""
+    for path in (folder / EVENTS, folder / EARLIER_EVENTS):
+        try:
+            return read_plain_file(path, limit=EVENTS_BYTES).splitlines()
+        except FileNotFoundError:
+            continue
+        except (OSError, ValueError):
+            break
+    return []
 
 
-def _is_well_typed(event: dict[str, Any]) -> bool:
-    """True if texts are str and numbers are bounded int or float, not bool; the file may be damaged."""
-    texts = [event["kind"], event["message"], event["unit"] or ""]
-    numbers = [value for name, value in event.items() if name not in ("kind", "message", "unit")]
-    return all(isinstance(text, str) for text in texts) and all(
-        type(number) in (int, float) and abs(number) < 2**63 for number in numbers
-    )
-
-
-def _rate(events: list[dict[str, Any]]) -> float | None:
-    if not events:
-        return None
-    recent = [event for event in events if event["time"] >= events[-1]["time"] - 60.0]
-    seconds = recent[-1]["time"] - recent[0]["time"]
-    steps = recent[-1]["steps_done"] - recent[0]["steps_done"]
-    return float(steps / seconds) if seconds > 0 and steps > 0 else None
-
-
-def _running(events: list[dict[str, Any]]) -> tuple[str, ...]:
-    running: dict[str, None] = {}
-    for event in events:
-        if event["kind"] in ("unit_done", "unit_failed"):
-            running.pop(event["unit"], None)
-        elif event["unit"]:
-            running[event["unit"]] = None
-    return tuple(running)
+def _is_event(event: object) -> bool:
+    """True if a value is an event with texts that are str and bounded numbers; the file may be damaged."""
+    if not isinstance(event, dict):
+        return False
+    if event.get("kind") == "rotated":
+        event = dict(event)
+        if not is_summary(event.pop("summary", None)):
+            return False
+    if set(event) != FIELDS:
+        return False
+    texts = (event["kind"], event["message"], event["unit"] or "")
+    return all(isinstance(text, str) for text in texts) and all(is_number(event[name]) for name in NUMBERS)

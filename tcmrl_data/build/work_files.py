@@ -3,13 +3,13 @@
 import stat
 from pathlib import Path
 
-from tcmrl_data.build.events import EVENTS
+from tcmrl_data.build.events import EARLIER_EVENTS, EVENTS
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.plain_files import file_problem
 
 WORK_FOLDERS = {STAGING, CHECKPOINTS}
-WORK_FILES = {LOCK, EVENTS}
+WORK_FILES = {LOCK, EVENTS, EARLIER_EVENTS}
 """A verification looks at their kind only, never into them."""
 
 
