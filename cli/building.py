@@ -221,7 +221,7 @@ def _parse_tasks(recipe: "Recipe", text: str | None) -> list[int] | None:
 
 
 def _show(event: "BuildEvent", progress: StageProgress) -> None:
-    if event.kind == "unit_failed":
+    if event.kind in ("unit_failed", "warning"):
         progress.note(event.message)
     progress.update("behavior training", done=event.steps_done, total=event.steps_total, unit="steps")
     progress.update("published parts", done=event.parts_done, total=event.parts_total, unit="parts")

@@ -204,7 +204,7 @@ def _count(findings: Sequence[object]) -> str:
 
 
 def _show(event: "BuildEvent", progress: StageProgress) -> None:
-    if event.kind == "unit_failed":
+    if event.kind in ("unit_failed", "warning"):
         progress.note(event.message)
     progress.update("behavior training", done=event.steps_done, total=event.steps_total, unit="steps")
     progress.update("parts", done=event.parts_done, total=event.parts_total, unit="parts")

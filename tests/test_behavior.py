@@ -42,7 +42,7 @@ def first_snapshot(recipe: Recipe, folder: Path, reported: list[int]) -> tuple[i
         observation=recipe.behavior.observation,
         reward=recipe.behavior.reward,
         report=reported.append,
-        checkpoints=lambda tasks: CheckpointFolder(folder, "unit", key="key", before=float("inf")),
+        checkpoints=lambda tasks: CheckpointFolder(folder, "unit", key="key", missing={}),
     )
     task, snapshot = next(iter(source.snapshots(context)))
     return task.index, snapshot.step, snapshot.digest()

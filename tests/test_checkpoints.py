@@ -1,5 +1,11 @@
-from collections.abc import Callable, Iterator
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -8,9 +14,15 @@ from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.build.driver import make_groups
+from tcmrl_data.build.plan import plan_build
+from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS
 from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.store.manifest import read_manifest
 from tests.conftest import TINY
+from tests.platforms import AVX2
 
 
 class Interrupted(Exception):
@@ -18,9 +30,14 @@ class Interrupted(Exception):
 
 
 def folder(
-    dataset: Path, *, key: str = "k", before: float = np.inf, seconds: float = 0.0
+    dataset: Path,
+    *,
+    key: str = "k",
+    missing: Mapping[int, int] = MappingProxyType({}),
+    seconds: float = 0.0,
+    warn: Callable[[str], None] = print,
 ) -> CheckpointFolder:
-    return CheckpointFolder(dataset, "task", key=key, before=before, seconds=seconds)
+    return CheckpointFolder(dataset, "task", key=key, missing=missing, seconds=seconds, warn=warn)
 
 
 def trained(
@@ -107,11 +124,78 @@ def test_the_last_one_replaces_the_others(saved: Callable[[], Path]) -> None:
     assert len(list((dataset / CHECKPOINTS / "task").iterdir())) == 1
 
 
-@pytest.mark.parametrize("change", [{"key": "other recipe"}, {"before": 10}])
+@pytest.mark.parametrize("change", [{"key": "other recipe"}, {"missing": {2: 10}}])
 def test_a_checkpoint_of_other_settings_or_past_a_missing_part_is_ignored(
     saved: Callable[[], Path], change: dict[str, object]
 ) -> None:
     assert folder(saved(), **change).load() is None  # type: ignore[arg-type]
+
+
+def test_a_failed_task_lacks_no_snapshot_after_its_failure(tmp_path: Path) -> None:
+    values = {"steps": 10, "failed": {"2": 10}}
+    folder(tmp_path).save(TrainingState(values, {"weights": np.zeros(2)}))
+    assert folder(tmp_path, missing={2: 10, 3: 20}).load() is not None
+    for missing in ({2: 5}, {2: 10, 3: 10}):  # a part that was lost, and a task that has not failed
+        assert folder(tmp_path, missing=missing).load() is None
+
+
+def test_a_checkpoint_that_cannot_be_written_is_reported_once_and_tried_again(tmp_path: Path) -> None:
+    (tmp_path / CHECKPOINTS).touch()  # where the folder must go
+    warnings: list[str] = []
+    checkpoints = folder(tmp_path, warn=warnings.append)
+    for step in (10, 20):
+        checkpoints.save(TrainingState({"steps": step}, {"weights": np.zeros(2)}))
+    assert len(warnings) == 1
+    assert warnings[0].startswith(f"training goes on without a new checkpoint: cannot write {tmp_path}")
+    (tmp_path / CHECKPOINTS).unlink()
+    checkpoints.save(TrainingState({"steps": 30}, {"weights": np.zeros(2)}))
+    state = checkpoints.load()
+    assert state is not None
+    assert state.values["steps"] == 30
+
+
+def test_a_unit_that_can_write_no_checkpoint_is_done_nevertheless(
+    tiny_folder: Path, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(CheckpointFolder, "is_due", lambda self: True)
+    plan = plan_build(tiny_recipe, tasks=[3])
+    make_groups(tmp_path, plan.tasks)
+    (tmp_path / CHECKPOINTS).touch()
+    messages: list[Mapping[str, Any]] = []
+    made = run_unit(UnitSpec(tmp_path, tiny_recipe, 0, plan.tasks), messages.append)
+    expected = [part.id for part in read_manifest(tiny_folder).parts if part.task == 3]
+    assert made == digest(expected)
+    assert [message["kind"] for message in messages].count("warning") == 1
+
+
+SAVE_OR_LOAD = """
+import json, sys
+import numpy as np
+from tcmrl_data.behavior.checkpoints import TrainingState
+from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.build.unit import UnitSpec, _checkpoints
+spec = UnitSpec.from_json(json.loads(sys.argv[2]))
+plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks)
+checkpoints = _checkpoints(spec, plan, spec.tasks, print)
+if sys.argv[1] == "save":
+    checkpoints.save(TrainingState({"steps": -1}, {"weights": np.zeros(2)}))  # before snapshot 0
+print(checkpoints.load() is not None)
+"""
+
+
+def test_a_checkpoint_of_another_platform_is_ignored(tiny_recipe: Recipe, tmp_path: Path) -> None:
+    spec = json.dumps(UnitSpec(tmp_path, tiny_recipe, 0, plan_build(tiny_recipe, tasks=[3]).tasks).to_json())
+    found = [
+        subprocess.run(
+            [sys.executable, "-c", SAVE_OR_LOAD, command, spec],
+            env=os.environ | variables,
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout.strip()
+        for command, variables in (("save", AVX2), ("load", AVX2), ("load", {}))
+    ]
+    assert found == ["True", "True", "False"]
 
 
 def test_a_damaged_checkpoint_is_ignored(saved: Callable[[], Path]) -> None:

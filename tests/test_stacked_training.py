@@ -1,5 +1,6 @@
 """Groups of tasks trained in lockstep: streams, resuming, units, and snapshots."""
 
+import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
@@ -17,13 +18,16 @@ from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.behavior.stacked.source import StackedSettings, StackedSource, _make_training
 from tcmrl_data.behavior.stacked.training import GroupTraining
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.unit import UnitSpec
+from tcmrl_data.build.driver import Driver, make_groups
+from tcmrl_data.build.plan import BuildPlan, plan_build
+from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.build.work_files import checkpoint_name
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import CHECKPOINTS, make_folders
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
 from tcmrl_data.store.manifest import part_folder, read_manifest
+from tcmrl_data.verification.garbage import collect_garbage
 
 TINY = (
     "behavior.stacked.group=4",
@@ -65,7 +69,7 @@ def context_of(
         observation=recipe.behavior.observation,
         reward=recipe.behavior.reward,
         report=report,
-        checkpoints=lambda _: CheckpointFolder(folder, "group", key="k", before=np.inf, seconds=seconds),
+        checkpoints=lambda _: CheckpointFolder(folder, "group", key="k", missing={}, seconds=seconds),
     )
 
 
@@ -176,6 +180,23 @@ def test_a_group_trains_its_done_tasks_again_and_leaves_their_parts_alone(
     }
 
 
+def test_gc_keeps_the_checkpoint_of_a_group_until_all_its_tasks_are_done(
+    dataset: Path, tmp_path: Path
+) -> None:
+    folder = tmp_path / "dataset"
+    shutil.copytree(dataset, folder)
+    unit = choose_tasks(recipe_of(), [1, 2, 3])
+    name = f"{CHECKPOINTS}/{checkpoint_name(unit)}"
+    make_folders(folder / name)
+    assert [(item.path, item.reason) for item in collect_garbage(folder, dry_run=True)] == [
+        (name, "tasks 1 to 3 are done")
+    ]
+    shutil.rmtree(folder / part_folder(3, 130))
+    Driver(plan_build(recipe_of(), tasks=TASKS), folder).write_manifest()
+    assert collect_garbage(folder) == ()
+    assert (folder / name).is_dir()
+
+
 def test_groups_are_a_function_of_indices() -> None:
     tasks = choose_tasks(recipe_of(), TASKS)
     groups = group_tasks(reversed(tasks), 4)
@@ -259,6 +280,43 @@ def test_a_diverged_agent_is_named_and_the_others_are_kept(tmp_path: Path) -> No
     with pytest.raises(BuildError, match=r"diverged: task 2 by step 130; use a smaller"):
         found.update(pairs)
     assert set(found) == {(1, 0), (2, 0), (3, 0), (1, 100), (2, 100), (3, 100), (1, 130), (3, 130)}
+
+
+@pytest.mark.usefixtures("poisoned")
+def test_the_others_of_a_diverged_agents_group_go_on_from_their_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    overrides = (*TINY, "behavior.stacked.steps=150", "behavior.stacked.snapshots=[0,100,120,150]")
+    recipe = recipe_of(overrides=overrides)
+    plan = plan_build(recipe, tasks=[1, 2, 3])
+    spec = UnitSpec(tmp_path, recipe, 0, plan.tasks)
+    make_groups(tmp_path, plan.tasks)
+    monkeypatch.setattr(CheckpointFolder, "is_due", lambda self: True)
+    advance, steps = GroupTraining.advance, 0
+
+    def counted(self: GroupTraining) -> None:
+        nonlocal steps
+        steps += 1
+        if steps == 145:
+            raise Interrupted
+        advance(self)
+
+    monkeypatch.setattr(GroupTraining, "advance", counted)
+    with pytest.raises(Interrupted):
+        run_unit(spec, lambda message: None)
+    steps = 200
+    with pytest.raises(BuildError, match=r"diverged: task 2 by step 120; use a smaller"):
+        run_unit(spec, lambda message: None)
+    assert steps - 200 <= 20  # from the last checkpoint
+    published = [
+        (index, step)
+        for index in (1, 2, 3)
+        for step in plan.source.steps
+        if (tmp_path / part_folder(index, step) / "part.json").is_file()
+    ]
+    assert published == [
+        (index, step) for index in (1, 2, 3) for step in (0, 100, 120, 150) if index != 2 or step <= 100
+    ]
 
 
 @pytest.mark.usefixtures("poisoned")

@@ -2,11 +2,12 @@
 
 A checkpoint is one safetensors file named by its sha256; its header holds counters and generator states as
 JSON. Nothing is pickled. A checkpoint that is damaged or has another key is ignored, and training starts
-from the beginning.
+from the beginning. A checkpoint that cannot be written is no reason to end a training.
 """
 
+import math
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,8 @@ from typing import Any
 import numpy.typing as npt
 
 from tcmrl_data.foundation.canonical import canonical_json, parse_json, sha256
-from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replace_file
+from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, named_errors, remove_tree, replace_file
+from tcmrl_data.foundation.errors import StorageError
 
 CHECKPOINT_SECONDS = 60.0
 CHECKPOINT_SHARE = 0.05
@@ -26,7 +28,8 @@ class TrainingState:
     """State of a training.
 
     Attributes:
-        values: JSON values; `steps` is the number of environment steps done.
+        values: JSON values; `steps` is the number of environment steps done, and `failed`, if it is there,
+            the first snapshot step that each failed task will never have, by task index as text.
         arrays: arrays by name.
     """
 
@@ -41,15 +44,24 @@ class CheckpointFolder:
         dataset: folder of the dataset.
         unit: name of the subfolder.
         key: digest of everything that the training depends on; a checkpoint with another key is ignored.
-        before: training step of the first missing snapshot; a checkpoint at this step or later is ignored.
+        missing: first missing snapshot step of every task that lacks one. A checkpoint at this step or later
+            is ignored, unless the task had failed by then.
         seconds: minimum time between two checkpoints; 0 for one at every opportunity.
+        warn: called with one line when a checkpoint could not be written, once.
     """
 
     def __init__(
-        self, dataset: Path, unit: str, *, key: str, before: float, seconds: float = CHECKPOINT_SECONDS
+        self,
+        dataset: Path,
+        unit: str,
+        *,
+        key: str,
+        missing: Mapping[int, int],
+        seconds: float = CHECKPOINT_SECONDS,
+        warn: Callable[[str], None] = lambda message: None,
     ) -> None:
         self._dataset, self._folder = dataset, dataset / CHECKPOINTS / unit
-        self._key, self._before = key, before
+        self._key, self._missing, self._warn, self._has_warned = key, missing, warn, False
         self._seconds, self._saved, self._cost = seconds, time.monotonic(), 0.0
 
     def is_due(self) -> bool:
@@ -58,18 +70,30 @@ class CheckpointFolder:
         return time.monotonic() - self._saved >= wait
 
     def save(self, checkpoint: TrainingState) -> None:
-        """Writes a checkpoint and removes the previous one."""
+        """Writes a checkpoint and removes the previous one.
+
+        If the disk refuses, the previous one stays, a warning is given, and the next time it is tried again.
+        """
+        began = time.monotonic()
+        try:
+            self._write(checkpoint)
+        except StorageError as error:
+            if not self._has_warned:
+                self._warn(f"training goes on without a new checkpoint: {error}")
+            self._has_warned = True
+        self._saved = time.monotonic()
+        self._cost = self._saved - began
+
+    def _write(self, checkpoint: TrainingState) -> None:
         from safetensors.numpy import save
 
-        began = time.monotonic()
         header = canonical_json({"key": self._key, "values": checkpoint.values}).decode()
         data = save(dict(checkpoint.arrays), metadata={"state": header})
         earlier = self._files()
         replace_file(self._folder / f"{sha256(data)}.safetensors", data, staging=self._dataset / STAGING)
         for file in earlier:
-            file.unlink(missing_ok=True)  # the unit may run in two processes at the same time
-        self._saved = time.monotonic()
-        self._cost = self._saved - began
+            with named_errors(file):
+                file.unlink(missing_ok=True)  # the unit may run in two processes at the same time
 
     def load(self) -> TrainingState | None:
         """The latest valid checkpoint, or None."""
@@ -83,11 +107,19 @@ class CheckpointFolder:
                     continue
                 header_bytes = int.from_bytes(data[:8], "little")
                 state = parse_json(parse_json(data[8 : 8 + header_bytes])["__metadata__"]["state"].encode())
-                if state["key"] == self._key and state["values"]["steps"] < self._before:
+                if state["key"] == self._key and self._lacks_nothing(state["values"]):
                     return TrainingState(state["values"], load(data))
-            except (OSError, ValueError, KeyError, TypeError, SafetensorError):
+            except (OSError, ValueError, KeyError, TypeError, AttributeError, SafetensorError):
                 continue
         return None
+
+    def _lacks_nothing(self, values: Mapping[str, Any]) -> bool:
+        """Whether a training that continues from a state yields every missing snapshot that it can."""
+        failed = values.get("failed", {})
+        return all(
+            values["steps"] < step or failed.get(str(task), math.inf) <= step
+            for task, step in self._missing.items()
+        )
 
     def clear(self) -> None:
         """Removes the checkpoint."""

@@ -132,6 +132,9 @@ class Driver:
             self._steps_done += message["count"]
             log.write(self._event("steps", unit, unit))
             return
+        if message["kind"] == "warning":
+            log.write(self._event("warning", f"{unit}: {message['message']}", unit))
+            return
         self._take_in(message["task"], message["step"])
         if time.monotonic() - self._written > MANIFEST_SECONDS:
             self.write_manifest()

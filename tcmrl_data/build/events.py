@@ -30,7 +30,7 @@ STEPS_SECONDS = 1.0
 MESSAGE_CHARACTERS = 1_000
 """A longer message is cut in the record."""
 
-EventKind = Literal["start", "steps", "part", "unit_done", "unit_failed", "end"]
+EventKind = Literal["start", "steps", "part", "warning", "unit_done", "unit_failed", "end"]
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,9 @@ def _measure(values: dict[str, Any], send: Send) -> str:
         observation=spec.recipe.behavior.observation,
         reward=spec.recipe.behavior.reward,
         report=clock.report,
-        checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
+        checkpoints=lambda tasks: CheckpointFolder(
+            Path(os.devnull), "", key="", missing={}, seconds=math.inf
+        ),
     )
     started = time.monotonic()
     try:

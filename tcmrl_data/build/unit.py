@@ -1,7 +1,6 @@
 """What one worker does: train a unit's behavior policies, roll them out, publish the parts. Idempotent."""
 
 import contextlib
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.build.part import PartMaker
 from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.provenance import package_versions
+from tcmrl_data.build.work_files import checkpoint_name
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import canonical_json, digest
@@ -81,7 +80,7 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
         observation=spec.recipe.behavior.observation,
         reward=spec.recipe.behavior.reward,
         report=lambda count: report({"kind": "steps", "count": count}),
-        checkpoints=lambda tasks: _checkpoints(spec, source, tasks),
+        checkpoints=lambda tasks: _checkpoints(spec, plan, tasks, report),
     )
     wanted = {task.index for task in spec.tasks if _missing_steps(spec, source, task)}
     recorded = source.provenance()
@@ -97,7 +96,7 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
             # simulators of many tasks would fill the memory: a group makes them anew for every part
             if snapshot.step == source.steps[-1] or len(wanted) > 1:
                 makers[task.index].close()
-    _checkpoints(spec, source, spec.tasks).clear()
+    _checkpoints(spec, plan, spec.tasks, report).clear()
 
 
 def _missing_steps(spec: UnitSpec, source: BehaviorSource, task: Task) -> list[int]:
@@ -109,16 +108,20 @@ def _missing_steps(spec: UnitSpec, source: BehaviorSource, task: Task) -> list[i
     ]
 
 
-def _checkpoints(spec: UnitSpec, source: BehaviorSource, tasks: Sequence[Task]) -> CheckpointFolder:
+def _checkpoints(spec: UnitSpec, plan: BuildPlan, tasks: Sequence[Task], report: Send) -> CheckpointFolder:
     """Where the tasks' training keeps its state; bound to everything that the training depends on."""
     key = {
         "data_version": DATA_VERSION,
         "settings": spec.recipe.unit_settings(),
         "seed": spec.seed,
         "tasks": [task.index for task in tasks],
-        "packages": package_versions(),
+        "platform": plan.platform.digest(),
     }
-    missing = [step for task in tasks for step in _missing_steps(spec, source, task)]
+    missing = {task.index: _missing_steps(spec, plan.source, task) for task in tasks}
     return CheckpointFolder(
-        spec.dataset, f"task_{tasks[0].index:05d}", key=digest(key), before=min(missing, default=math.inf)
+        spec.dataset,
+        checkpoint_name(tasks),
+        key=digest(key),
+        missing={index: steps[0] for index, steps in missing.items() if steps},
+        warn=lambda message: report({"kind": "warning", "message": message}),
     )

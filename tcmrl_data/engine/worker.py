@@ -21,7 +21,8 @@ from tcmrl_data.foundation.errors import TcmrlError
 REPORT_SECONDS = 0.5
 
 Send = Callable[[Mapping[str, Any]], None]
-"""Receives a unit's messages. A message has a `kind`; messages of kind `steps` have a `count` to add up."""
+"""Receives a unit's messages. A message has a `kind`; messages of kind `steps` have a `count` to add up,
+messages of kind `warning` a `message` for people."""
 
 
 class _Reporter:

@@ -1,10 +1,10 @@
-"""Removal of files that builds no longer need: abandoned staging and checkpoints of finished tasks."""
+"""Removal of files that builds no longer need: abandoned staging and checkpoints of finished units."""
 
-import re
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.work_files import check_work_files
+from tcmrl_data.build.work_files import check_work_files, checkpoint_tasks
 from tcmrl_data.foundation.disk import (
     CHECKPOINTS,
     LOCK,
@@ -17,8 +17,6 @@ from tcmrl_data.foundation.disk import (
 from tcmrl_data.foundation.errors import BuildError, LockedError
 from tcmrl_data.store.manifest import MANIFEST, dataset_folder, read_manifest
 from tcmrl_data.verification.repair import REPAIR
-
-CHECKPOINT = re.compile(r"task_([0-9]{5,10})")
 
 
 @dataclass(frozen=True)
@@ -37,7 +35,7 @@ class Garbage:
 
 
 def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage, ...]:
-    """Removes abandoned staging and checkpoints of tasks whose parts are all published.
+    """Removes abandoned staging, and checkpoints of units all of whose tasks have all parts published.
 
     Args:
         path: the dataset's folder or its `manifest.json`.
@@ -79,23 +77,26 @@ def _garbage(folder: Path) -> tuple[Garbage, ...]:
             is_abandoned = True
         if is_abandoned:
             found.append(Garbage(f"{STAGING}/{path.name}", "abandoned by a build that ended", _size(path)))
-    finished = _finished_tasks(folder)
+    is_done = _done_tasks(folder)
     for path in sorted(checkpoints.iterdir()) if checkpoints.is_dir() else []:
-        match = CHECKPOINT.fullmatch(path.name)
-        if match and int(match[1]) in finished:
-            found.append(Garbage(f"{CHECKPOINTS}/{path.name}", f"task {int(match[1])} is done", _size(path)))
+        tasks = checkpoint_tasks(path.name)
+        if (
+            tasks
+            and {tasks[0], tasks[-1]} <= set(is_done)
+            and all(done for index, done in is_done.items() if index in tasks)
+        ):
+            reason = f"task {tasks[0]} is" if len(tasks) == 1 else f"tasks {tasks[0]} to {tasks[-1]} are"
+            found.append(Garbage(f"{CHECKPOINTS}/{path.name}", f"{reason} done", _size(path)))
     return tuple(found)
 
 
-def _finished_tasks(folder: Path) -> set[int]:
-    """Tasks with every part in the manifest; none where there is no manifest yet."""
+def _done_tasks(folder: Path) -> dict[int, bool]:
+    """Whether every part of a task is in the manifest, by index; empty where there is no manifest yet."""
     if not (folder / MANIFEST).exists():
-        return set()
+        return {}
     manifest = read_manifest(folder)
-    counts: dict[int, int] = {}
-    for entry in manifest.parts:
-        counts[entry.task] = counts.get(entry.task, 0) + 1
-    return {task for task, count in counts.items() if count == len(manifest.steps)}
+    counts = Counter(entry.task for entry in manifest.parts)
+    return {task.index: counts[task.index] == len(manifest.steps) for task in manifest.tasks}
 
 
 def _size(path: Path) -> int:

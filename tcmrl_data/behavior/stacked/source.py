@@ -95,11 +95,12 @@ class StackedSource(BehaviorSource):
             if checkpoint is not None:
                 training.restore(checkpoint)
                 steps_done = training.steps
+                diverged |= {int(task): step for task, step in checkpoint.values["failed"].items()}
                 context.report(steps_done * len(context.tasks))
             for step in self.settings.snapshots:
                 while training.steps < step:
                     if checkpoints.is_due():
-                        checkpoints.save(training.capture())
+                        checkpoints.save(training.capture(failed=diverged))
                     chunk = min(REPORT_EVERY, step - training.steps)
                     with _matmul_precision(self.settings.matmul_precision):
                         for _ in range(chunk):

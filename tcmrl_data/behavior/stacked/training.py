@@ -5,7 +5,7 @@ Every random stream belongs to one task, so an agent draws the same numbers in a
 
 import copy
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, final
 
 import numpy as np
@@ -222,13 +222,18 @@ class GroupTraining:
         }
         return Snapshot(self.steps, description, tensors)
 
-    def capture(self) -> TrainingState:
-        """Captures the complete state of the training, at any step."""
+    def capture(self, *, failed: Mapping[int, int]) -> TrainingState:
+        """Captures the complete state of the training, at any step.
+
+        Args:
+            failed: by task index, the first snapshot step whose policy was not finite.
+        """
         arrays = {f"learner.{name}": tensor.cpu().numpy() for name, tensor in self.learner.state().items()}
         arrays["replay"] = np.ascontiguousarray(self._replay.rows[:, : self._replay.size].cpu().numpy())
         arrays["episodes.actions"] = self._episodes.actions
         values = {
             "steps": self.steps,
+            "failed": {str(task): step for task, step in failed.items()},
             "episodes": {
                 "numbers": self._episodes.numbers.tolist(),
                 "lengths": self._episodes.lengths.tolist(),
