@@ -1,6 +1,7 @@
 import json
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -9,6 +10,7 @@ from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
 from tcmrl_data.recipe.comments import read_comments
 from tcmrl_data.recipe.profile import PROFILES, Profile
+from tcmrl_data.recipe.recipe import full_settings
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.recipe.values import recipe_values
 from tests.environments import some_members
@@ -108,6 +110,48 @@ def test_only_data_settings_are_unit_settings() -> None:
         load_recipe("point-robot", overrides=["rollouts.episodes=100"]).unit_settings()
         != base.unit_settings()
     )
+
+
+def lacking(values: dict[str, Any], *path: str) -> dict[str, Any]:
+    """Settings as a version recorded them that did not know the field at `path`."""
+    copy: dict[str, Any] = json.loads(json.dumps(values))
+    table = copy
+    for key in path[:-1]:
+        table = table[key]
+    del table[path[-1]]
+    return copy
+
+
+@pytest.mark.parametrize(
+    "path",
+    [("environment", "goal_radius"), ("behavior", "observation"), ("behavior", "settings", "gradient_steps")],
+)
+def test_settings_recorded_without_a_later_field_have_its_default(path: tuple[str, ...]) -> None:
+    settings = load_recipe("sparse-point-robot").unit_settings()
+    assert full_settings(settings) == settings
+    assert full_settings(lacking(settings, *path)) == settings
+
+
+def test_a_field_with_another_value_than_its_default_makes_other_settings() -> None:
+    changed = load_recipe("point-robot-wind", overrides=["environment.wind_limit=0.1"]).unit_settings()
+    older = lacking(changed, "environment", "wind_limit")
+    assert full_settings(older) != changed
+    assert full_settings(older) == load_recipe("point-robot-wind").unit_settings()
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("rollouts", "recorded settings: unknown key rollouts.later"),
+        ("environment", "recorded settings: unknown key environment.later"),
+        ("behavior", "recorded settings: unknown key behavior.later"),
+    ],
+)
+def test_settings_recorded_by_a_later_version_are_refused(table: str, message: str) -> None:
+    settings = load_recipe("point-robot").unit_settings()
+    settings[table]["later"] = 1
+    with pytest.raises(RecipeError, match=message):
+        full_settings(settings)
 
 
 @pytest.mark.parametrize("value", ["0.0", "-0.1", "inf"])

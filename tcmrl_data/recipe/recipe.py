@@ -101,6 +101,14 @@ class BehaviorTable(_Table):
     settings: dict[str, Any]
 
 
+class _UnitSettings(_Table):
+    """The tables of a recipe that determine the data of a part."""
+
+    environment: EnvironmentTable
+    behavior: BehaviorTable
+    rollouts: Rollouts
+
+
 class Recipe(_Table):
     """A resolved recipe: one environment, one profile, one behavior source.
 
@@ -171,6 +179,31 @@ def load_recipe(
         build=validated(TaskChoice, tables.get("build", {}), table="build"),
         training=training | {profile: tables.get("training", {})},
     )
+
+
+def full_settings(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """Unit settings that a manifest or a part recorded, with the defaults of the fields that they lack.
+
+    A field that was added later thus makes no difference where it has its default, which must give the data
+    that were made before. The result compares with `Recipe.unit_settings`.
+
+    Args:
+        recorded: the result of `Recipe.unit_settings`, by this version or an older one.
+
+    Raises:
+        UnknownNameError: an environment or behavior source that is not installed.
+        RecipeError: a key that this version does not know, or a value that is not valid.
+    """
+    validated = functools.partial(validate_table, place="recorded settings", error=RecipeError)
+    tables = validated(_UnitSettings, recorded)
+    source = tables.behavior
+    kind, source_kind = ENVIRONMENTS.get(tables.environment.name), BEHAVIOR_SOURCES.get(source.source)
+    environment = validated(kind.Settings, recorded["environment"], table="environment")
+    settings = validated(source_kind.Settings, source.settings, table="behavior.settings")
+    return tables.model_dump(mode="json") | {
+        "environment": environment.model_dump(mode="json"),
+        "behavior": source.model_dump(mode="json") | {"settings": settings.model_dump(mode="json")},
+    }
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:
