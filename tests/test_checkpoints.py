@@ -2,7 +2,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -14,9 +14,12 @@ from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.build import build
 from tcmrl_data.build.driver import make_groups
+from tcmrl_data.build.events import EVENTS, BuildEvent
 from tcmrl_data.build.plan import plan_build
 from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS
 from tcmrl_data.recipe.tasks import choose_tasks
@@ -166,6 +169,21 @@ def test_a_unit_that_can_write_no_checkpoint_is_done_nevertheless(
     expected = [part.id for part in read_manifest(tiny_folder).parts if part.task == 3]
     assert made == digest(expected)
     assert [message["kind"] for message in messages].count("warning") == 1
+
+
+def test_the_warning_of_a_unit_reaches_the_record_and_the_user(
+    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Engine(BaseEngine):
+        def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
+            on_message(units[0].id, {"kind": "warning", "message": "the disk is full"})
+            yield Result(units[0].id, False, None, "ended", 1, "here")
+
+    monkeypatch.setattr(build.ENGINES, "get", lambda name: Engine)
+    seen: list[BuildEvent] = []
+    build.build_dataset(tiny_recipe, tmp_path / "out", tasks=[3], progress=seen.append)
+    assert [event.message for event in seen if event.kind == "warning"] == ["task 3: the disk is full"]
+    assert '"task 3: the disk is full"' in (tmp_path / "out" / EVENTS).read_text()
 
 
 SAVE_OR_LOAD = """
