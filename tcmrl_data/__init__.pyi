@@ -50,11 +50,12 @@ from .recipe.values import recipe_values as recipe_values
 from .sampling.batch import Batch as Batch
 from .sampling.batch import Moments as Moments
 from .sampling.batch import Steps as Steps
-from .sampling.cache import CacheEntry as CacheEntry
 from .sampling.cache import cache_folder as cache_folder
 from .sampling.cache import cache_limit as cache_limit
 from .sampling.cache import clear_cache as clear_cache
 from .sampling.cache import list_cache as list_cache
+from .sampling.cache import verify_cache as verify_cache
+from .sampling.cache_room import CacheEntry as CacheEntry
 from .sampling.prefetch import Prefetch as Prefetch
 from .sampling.request import BatchRequest as BatchRequest
 from .sampling.request import Trajectories as Trajectories

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tracemalloc
@@ -25,12 +26,16 @@ from tcmrl_data import (
     open_sampler,
     parse_bytes,
 )
+from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.errors import CacheError, StoreError
-from tcmrl_data.sampling import cache
+from tcmrl_data.sampling import cache, cache_entry
 from tcmrl_data.sampling.cache import cached_rows, load_rows
-from tcmrl_data.sampling.cache_entry import _write_rows
+from tcmrl_data.sampling.cache_entry import RECORD_BYTES
+from tcmrl_data.sampling.cache_table import TableSeal, write_table
 from tcmrl_data.sampling.rows import Indices, PartRows, Table, read_rows
+from tcmrl_data.store.arrays import array_digests, encode_arrays
 from tests.commands import Call, in_process
+from tests.hostile_corpus import STEP, Forge, base
 
 REQUEST = BatchRequest(
     tasks=16, kinds={"policy": Transitions(20), "context": Trajectories(1), "windows": Windows(5, length=3)}
@@ -80,12 +85,35 @@ def test_the_limit_decides(selection: Selection, folder: Path, monkeypatch: pyte
     assert len(entries(folder)) == 1
 
 
-def test_the_key_is_the_selection_and_the_root(tiny: Dataset, folder: Path) -> None:
+def test_every_selection_has_an_entry_that_equal_parts_share(
+    tiny: Dataset, tiny_copy: Callable[[], Path], folder: Path
+) -> None:
     cached_rows(tiny.select(split="train"))
     cached_rows(tiny.select(split="train", snapshots="last"))
-    other = Dataset(tiny.folder, tiny.manifest.model_copy(update={"root": "0" * 64}))
-    cached_rows(other.select(split="train"))
-    assert len(entries(folder)) == 3
+    cached_rows(open_dataset(tiny_copy()).select(split="train"))
+    assert len(entries(folder)) == 2
+
+
+@pytest.mark.parametrize("claim", ["part", "root"])
+def test_a_forged_copy_never_takes_the_place_of_the_honest_dataset(
+    tiny: Dataset, tmp_path: Path, claim: str
+) -> None:
+    """A copy with other rewards that claims the id of the honest part, or the root of the honest dataset."""
+    honest = open_dataset(base(tiny.folder, tmp_path / "honest"))
+    forge = Forge(base(tiny.folder, tmp_path / "forged"), tmp_path)
+    rewards = honest.arrays(0, STEP)["rewards"] + 1
+    forge.write("rewards/c/0", encode_arrays({"rewards": rewards})["rewards/c/0"])
+    if claim == "root":
+        found = array_digests({"rewards": rewards})["rewards"]
+        forge.record(lambda values: values["identity"]["arrays"]["rewards"].update(found))
+    forged = open_dataset(forge.folder)
+    forged = Dataset(forged.folder, forged.manifest.model_copy(update={"root": honest.manifest.root}))
+    if claim == "part":
+        with pytest.raises(StoreError, match=r"forged.*rewards is not the array that part.json records"):
+            cached_rows(forged.select())
+    else:
+        cached_rows(forged.select())
+    np.testing.assert_array_equal(cached_rows(honest.select()).table, read_rows(honest.select()).table)
 
 
 @pytest.mark.parametrize(
@@ -93,11 +121,9 @@ def test_the_key_is_the_selection_and_the_root(tiny: Dataset, folder: Path) -> N
     [
         *(
             (file, damage)
-            for file in ("record.json", "episodes.i64")
+            for file in ("record.json", "episodes.i64", "blocks.bin", "rows.f32")
             for damage in ("cut", "missing", "flipped")
-        ),
-        ("rows.f32", "cut"),
-        ("rows.f32", "missing"),
+        )
     ],
 )
 def test_a_torn_entry_is_made_again(selection: Selection, folder: Path, file: str, damage: str) -> None:
@@ -110,13 +136,41 @@ def test_a_torn_entry_is_made_again(selection: Selection, folder: Path, file: st
         flipped = content[:-9] + bytes([content[-9] ^ 1]) + content[-8:]
         (entry / file).write_bytes(content[:-4] if damage == "cut" else flipped)
     np.testing.assert_array_equal(cached_rows(selection).table, expected)
-    assert (entries(folder)[0] / file).read_bytes() == content
+    if file != "record.json":  # it holds the number and the time of the new table's file
+        assert (entries(folder)[0] / file).read_bytes() == content
 
 
-def test_what_is_read_is_never_evicted(
-    selection: Selection, tiny: Dataset, folder: Path, monkeypatch: pytest.MonkeyPatch
+def test_a_large_table_that_was_changed_is_hashed(
+    selection: Selection, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("TCMRL_CACHE_LIMIT", "1k")
+    """One byte in its padding, with the old time of writing; a table that was not changed is not hashed."""
+    monkeypatch.setattr(cache_entry, "CHECKED_BYTES", 0)
+    cached_rows(selection)
+    table = entries(folder)[0] / "rows.f32"
+    before = table.stat()
+    with monkeypatch.context() as patch:
+        patch.setattr(cache_entry, "table_problem", lambda file, blocks: pytest.fail("hashed"))
+        cached_rows(selection)
+    with table.open("r+b") as file:
+        file.seek(-1, os.SEEK_END)
+        file.write(b"\1")
+    os.utime(table, ns=(before.st_atime_ns, before.st_mtime_ns))
+    np.testing.assert_array_equal(cached_rows(selection).table, read_rows(selection).table)
+
+
+def test_a_copied_cache_is_used(
+    selection: Selection, tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cached_rows(selection)
+    shutil.copytree(folder, tmp_path / "copied")
+    monkeypatch.setenv("TCMRL_CACHE", str(tmp_path / "copied"))
+    said: list[str] = []
+    rows = cached_rows(selection, say=said.append)
+    np.testing.assert_array_equal(rows.table, read_rows(selection).table)
+    assert said == []
+
+
+def test_what_is_read_is_never_evicted(selection: Selection, tiny: Dataset, folder: Path) -> None:
     sampler = open_sampler(selection, REQUEST, seed=0, memory_limit=1)
     expected = open_sampler(selection, REQUEST, seed=0).batch(3)
     cached_rows(tiny.select(split="train", snapshots="last"))
@@ -152,7 +206,7 @@ def test_what_was_used_longest_ago_goes_first(tiny: Dataset, monkeypatch: pytest
         os.utime(cache.cache_folder() / "rows" / key / "record.json", (1000 + age, 1000 + age))
     cached_rows(old)
     first, second = list_cache()
-    monkeypatch.setenv("TCMRL_CACHE_LIMIT", str(first.bytes + second.bytes))
+    monkeypatch.setenv("TCMRL_CACHE_LIMIT", str(first.bytes + second.bytes + RECORD_BYTES))
     cached_rows(new)
     left = {entry.key for entry in list_cache()}
     assert len(left) == 2 and first.key not in left and second.key in left
@@ -160,7 +214,7 @@ def test_what_was_used_longest_ago_goes_first(tiny: Dataset, monkeypatch: pytest
 
 def test_a_disk_without_room_is_refused(selection: Selection, monkeypatch: pytest.MonkeyPatch) -> None:
     usage = type("Usage", (), {"free": 10})
-    monkeypatch.setattr("tcmrl_data.sampling.cache.shutil.disk_usage", lambda path: usage)
+    monkeypatch.setattr("tcmrl_data.sampling.cache_room.shutil.disk_usage", lambda path: usage)
     with pytest.raises(CacheError, match="TCMRL_CACHE"):
         cached_rows(selection)
 
@@ -182,16 +236,17 @@ def test_decoding_takes_the_memory_of_the_parts_at_work(
 ) -> None:
     """A table of 40 parts of 1 MB, decoded by one reader."""
 
-    def fill(part: PartRows, out: Table) -> Indices:
+    def fill(part: PartRows, out: Table, *, check_digests: bool) -> Indices:
         out[...] = part.first
         return np.array([len(out) - 1])
 
     monkeypatch.setattr("tcmrl_data.sampling.rows.READERS", 1)
-    monkeypatch.setattr("tcmrl_data.sampling.cache_entry.read_part", fill)
+    monkeypatch.setattr("tcmrl_data.sampling.cache_table.read_part", fill)
     rows = 2**18 // 8
-    plan = [PartRows(tmp_path, 0, rows * i, rows * (i + 1)) for i in range(40)]
+    plan = [PartRows(tmp_path, 0, rows * i, rows * (i + 1), {}) for i in range(40)]
+    (tmp_path / "rows").touch()
     tracemalloc.start()
-    _write_rows(tmp_path / "rows", plan, (40 * rows, 8))
+    write_table(tmp_path / "rows", plan, (40 * rows, 8))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 3 * 2**20
@@ -221,7 +276,33 @@ def test_list_and_clear_commands(
     document = json.loads(call("cache", "list", "--json")[1])
     assert document["folder"] == str(folder) and document["limit"] == 100 * 10**9
     (entry,) = document["entries"]
-    assert (entry["environment"], entry["tasks"], entry["in_use"]) == ("point-robot", 4, False)
+    assert (entry["environment"], entry["tasks"], entry["parts"]) == ("point-robot", 4, 12)
+    assert entry["dataset"] == str(selection.dataset.folder) and not entry["in_use"]
     assert "point-robot" in call("cache", "list")[1]
     assert json.loads(call("cache", "clear", "--json")[1]) == {"removed": [entry], "kept": []}
     assert not entries(folder)
+
+
+def test_verify_finds_what_the_disk_damaged_and_opening_does_not(
+    selection: Selection, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Damage of the disk changes no time; here the record says that the damaged file is the sealed one."""
+    monkeypatch.setattr(cache_entry, "CHECKED_BYTES", 0)
+    call: Call = in_process(data, capsys)
+    rows = cached_rows(selection)
+    (entry,) = entries(folder)
+    assert json.loads(call("cache", "verify", "--json")[1]) == {"checked": 1, "damaged": []}
+    content = bytearray((entry / "rows.f32").read_bytes())
+    content[0] ^= 1
+    (entry / "rows.f32").write_bytes(content)
+    record = json.loads((entry / "record.json").read_bytes().partition(b"\n")[2])
+    record["seal"] = TableSeal.of(entry / "rows.f32").model_dump()
+    text = canonical_json(record)
+    (entry / "record.json").write_bytes(sha256(text).encode() + b"\n" + text)
+    assert cached_rows(selection).table.tobytes() == content
+    code, output, errors = call("cache", "verify")
+    assert code == 1 and "rows.f32 are not those that were written; kept, because it is in use" in output
+    assert errors == "Error: 1 of 1 entries are damaged\n"
+    del rows
+    damaged = json.loads(call("cache", "verify", "--json")[1])["damaged"]
+    assert [row["removed"] for row in damaged] == [True] and not entries(folder)

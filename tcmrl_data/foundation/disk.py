@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import fcntl
 import os
 import shutil
 import tempfile
@@ -213,29 +212,28 @@ def lock_file(path: Path, what: str) -> Iterator[Path]:
         ReadOnlyError: the folder cannot be written.
         StorageError: the file system has no locks.
     """
-    with _open_lock(path) as file:
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(_open_lock(path))
         with named_errors(path, remedy="choose a folder on a file system with locks"):
             is_ours = try_exclusive_lock(file)
         if not is_ours:
             raise LockedError(f"{what} is being written by {_holder(path)}; wait for it or stop it")
-        file.truncate(0)
-        file.write(f"process {os.getpid()} on {os.uname().nodename}")
-        file.flush()
+        if not is_current(file, path):  # its last holder removed it after it was opened here
+            stack.close()
+            stack.enter_context(lock_file(path, what))
+        else:
+            file.truncate(0)
+            file.write(f"process {os.getpid()} on {os.uname().nodename}")
+            file.flush()
         yield path
 
 
-def try_lock(file: IO[Any], kind: int) -> bool:
-    """Takes a lock on an open file; returns False if another holder prevents it.
-
-    Args:
-        file: the open file.
-        kind: `fcntl.LOCK_SH` or `fcntl.LOCK_EX`.
-    """
+def is_current(file: IO[Any], path: Path) -> bool:
+    """Whether the path still refers to the open file."""
     try:
-        fcntl.flock(file, kind | fcntl.LOCK_NB)
-    except BlockingIOError:
+        return os.path.samestat(os.fstat(file.fileno()), path.stat())
+    except FileNotFoundError:
         return False
-    return True
 
 
 def _open_lock(path: Path) -> TextIO:

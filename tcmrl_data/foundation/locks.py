@@ -1,4 +1,4 @@
-"""Exclusive locks on open files, which also hold between machines that share a folder over NFS.
+"""Exclusive and shared locks on open files, which also hold between machines that share a folder over NFS.
 
 On Linux a lock is an open file description lock of `fcntl`, for three reasons:
 
@@ -6,7 +6,7 @@ On Linux a lock is an open file description lock of `fcntl`, for three reasons:
   lock, as `flock` needs, makes a writer that starts at that moment fail.
 - It belongs to the open file, not to the process as classic POSIX locks do: two writers in one process
   exclude each other, and closing another descriptor of the same file does not release it.
-- NFS passes it to the server, and grants it to a file that is open for writing.
+- NFS passes it to the server, and grants it to a file that is open for writing; a shared one, for reading.
 
 Other systems have no such locks; there `flock` is used, and a writer waits while others ask.
 """
@@ -51,8 +51,25 @@ def try_exclusive_lock(file: IO[Any]) -> bool:
     return True
 
 
+def take_shared_lock(file: IO[Any]) -> None:
+    """Takes the shared lock on a file; waits while another open file holds the exclusive lock.
+
+    Args:
+        file: open for reading; closing it releases the lock.
+
+    Raises:
+        OSError: the file system has no locks.
+    """
+    if HAS_OPEN_FILE_LOCKS:
+        fcntl.fcntl(file, fcntl.F_OFD_SETLKW, struct.pack(_FLOCK, fcntl.F_RDLCK, *_WHOLE_FILE))
+    else:
+        fcntl.flock(file, fcntl.LOCK_SH)
+
+
 def is_locked(file: IO[Any]) -> bool:
-    """True if another open file holds the exclusive lock; on Linux, asking never disturbs a writer.
+    """True if another open file holds the exclusive lock; on Linux also for a shared one.
+
+    On Linux, asking never disturbs a writer.
 
     Args:
         file: may be open for reading only.

@@ -1,42 +1,38 @@
 """One entry of the cache: packed rows as files that are mapped into memory.
 
-`rows.f32` is the table. `episodes.i64` holds starts, lengths and task ranges. `record.json` holds the digest
-of the record in its first line, then the record. An entry is forced to disk, published by one rename, and
-never changes. A reader holds a shared lock on its record.
+`rows.f32` is the table. `episodes.i64` holds starts, lengths and task ranges. `blocks.bin` holds the sha256
+of every part's rows in the table. `record.json` holds the digest of the record in its first line, then the
+record, with the digests of the two small files and the seal of the table. An entry is forced to disk,
+published by one rename, and never changes. A reader holds a shared lock on its record.
+
+What opening an entry checks: the small files by digest, and that the table is still the file that was sealed:
+size, inode, and the time of its last change, which a program cannot set back. So a table that was cut, edited
+or replaced is found at once. A table of up to CHECKED_BYTES is hashed as well, and so is every table that is
+not the sealed file (a copied cache). What opening does not find is damage below the file system in a larger
+table; `tcmrl-data cache verify` hashes every table and finds it. Nothing here guards against a person who may
+write to the cache's folder and forges a whole entry: give write access only to those who are trusted.
 """
 
 import contextlib
-import fcntl
 import os
-import uuid
 import weakref
-from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from tcmrl_data.foundation.canonical import canonical_json, sha256
-from tcmrl_data.foundation.disk import (
-    STAGING,
-    disk,
-    lock_file,
-    make_folders,
-    move_into_place,
-    named_errors,
-    remove_tree,
-    write_file,
-)
+from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
+from tcmrl_data.foundation.disk import disk, is_current, named_errors, write_file
+from tcmrl_data.foundation.locks import take_shared_lock
+from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.sampling.cache_table import BLOCK, Blocks, TableSeal, table_problem, write_table
 from tcmrl_data.sampling.rows import (
+    ROW_ARRAYS,
     Episodes,
-    Indices,
     PackedRows,
-    PartRows,
     Table,
-    map_parts,
     plan_rows,
-    read_part,
     selection_rows,
     table_shape,
 )
@@ -44,12 +40,19 @@ from tcmrl_data.sampling.rows import (
 if TYPE_CHECKING:
     from tcmrl_data.dataset.selection import Selection
 
-FORMAT = 1
+FORMAT = 2
 """Increased when the layout of an entry changes; entries of another format are not opened."""
+
+CHECKED_BYTES = 10**9
+"""A table up to this size is hashed whenever it is opened, which takes about a second on one core."""
+
+RECORD_BYTES = 2**15
+"""More than a record takes."""
 
 RECORD = "record.json"
 ROWS = "rows.f32"
 EPISODES = "episodes.i64"
+BLOCKS = "blocks.bin"
 
 
 class EntryRecord(BaseModel):
@@ -57,28 +60,57 @@ class EntryRecord(BaseModel):
 
     Attributes:
         format: FORMAT of the version that wrote the entry.
+        key: name of its folder.
         environment: name of the dataset's environment.
-        root: Merkle root of the dataset.
-        selection: (index, snapshot steps) per task.
+        dataset: folder of the dataset that it was decoded from; equal parts elsewhere share the entry.
+        tasks: number of selected tasks.
+        parts: number of selected parts.
         shape: (rows, floats per row) of the table.
         episodes: number of episodes with at least one step.
         episodes_sha256: digest of the file of episodes.
+        blocks_sha256: digest of the file of blocks.
+        seal: the finished table.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     format: int
+    key: str
     environment: str
-    root: str
-    selection: tuple[tuple[int, tuple[int, ...]], ...]
+    dataset: str
+    tasks: int
+    parts: int
     shape: tuple[int, int]
     episodes: int
     episodes_sha256: str
+    blocks_sha256: str
+    seal: TableSeal
 
-    @property
-    def row_bytes(self) -> int:
-        """Size of the file of rows."""
-        return 4 * self.shape[0] * self.shape[1]
+
+def entry_key(selection: "Selection") -> str:
+    """The name of a selection's entry: a digest of what its rows hold, whatever the dataset claims.
+
+    A part's id is the digest of its identity, which holds the sha256 of every decoded array.
+    """
+    dataset = selection.dataset
+    parts = [
+        (task.index, step, dataset.part(task.index, step).id)
+        for task in selection.tasks
+        for step in selection.steps[task.index]
+    ]
+    environment = dataset.environment
+    layout = (*ROW_ARRAYS, environment.observation_dim, environment.action_dim)
+    return digest({"format": FORMAT, "layout": layout, "parts": parts})[:32]
+
+
+def entry_bytes(selection: "Selection") -> int:
+    """The most that a selection's entry takes on disk, in bytes."""
+    plan = plan_rows(selection)
+    rows, width = table_shape(selection, plan)
+    episodes = sum(part.records["episode_offsets"].shape[0] - 1 for part in plan)
+    return (
+        4 * rows * width + 16 * (episodes + len(selection.tasks)) + BLOCK.itemsize * len(plan) + RECORD_BYTES
+    )
 
 
 def open_entry(entry: Path, selection: "Selection") -> PackedRows | None:
@@ -89,32 +121,28 @@ def open_entry(entry: Path, selection: "Selection") -> PackedRows | None:
         return None
     with contextlib.ExitStack() as stack:
         stack.enter_context(file)
-        fcntl.flock(file, fcntl.LOCK_SH)  # an eviction or a listing holds the exclusive lock only briefly
+        take_shared_lock(file)  # an eviction holds the exclusive lock only briefly
         record = read_entry(file)
-        if not is_current(file, entry / RECORD) or record is None:
+        if not is_current(file, entry / RECORD) or record is None or record.key != entry.name:
             return None
-        episodes = _read_episodes(entry / EPISODES, record, len(selection.tasks))
-        if episodes is None or not _has_size(entry / ROWS, record.row_bytes):
+        if entry_problem(entry, record, limit=CHECKED_BYTES):
             return None
-        os.utime(entry / RECORD)
+        with contextlib.suppress(OSError):  # a cache that may only be read
+            os.utime(entry / RECORD)
+        return _map_rows(entry, record, selection, stack.pop_all())
+
+
+def _map_rows(
+    entry: Path, record: EntryRecord, selection: "Selection", lock: contextlib.ExitStack
+) -> PackedRows:
+    """The rows of a checked entry; its lock is released with the table."""
+    with lock:
+        data = np.frombuffer((entry / EPISODES).read_bytes(), dtype=np.int64)
+        starts, lengths, ranges = np.split(data, [record.episodes, 2 * record.episodes])
         # copy on write, because torch requires writable memory and the file must not change
         table: Table = np.memmap(entry / ROWS, dtype=np.float32, mode="c", shape=record.shape)
-        weakref.finalize(table, stack.pop_all().close)
-        return selection_rows(selection, table, episodes)
-
-
-def _has_size(path: Path, size: int) -> bool:
-    return path.is_file() and path.stat().st_size == size
-
-
-def is_current(file: IO[bytes], path: Path) -> bool:
-    """Whether the path still refers to the open file."""
-    return path.exists() and os.path.samestat(os.fstat(file.fileno()), path.stat())
-
-
-def selected(selection: "Selection") -> tuple[tuple[int, tuple[int, ...]], ...]:
-    """A selection as (task index, snapshot steps) per task."""
-    return tuple((task.index, selection.steps[task.index]) for task in selection.tasks)
+        weakref.finalize(table, lock.pop_all().close)
+    return selection_rows(selection, table, Episodes(starts, lengths, ranges.reshape(-1, 2)))
 
 
 def read_entry(file: IO[bytes]) -> EntryRecord | None:
@@ -129,75 +157,81 @@ def read_entry(file: IO[bytes]) -> EntryRecord | None:
     return record if record.format == FORMAT else None
 
 
-def _read_episodes(file: Path, record: EntryRecord, num_tasks: int) -> Episodes | None:
-    data = file.read_bytes() if file.is_file() else b""
-    if sha256(data) != record.episodes_sha256:
-        return None
-    starts, lengths, ranges = np.split(
-        np.frombuffer(data, dtype=np.int64), [record.episodes, 2 * record.episodes]
-    )
-    return Episodes(starts, lengths, ranges.reshape(num_tasks, 2))
-
-
-def write_entry(folder: Path, entry: Path, selection: "Selection") -> None:
-    """Decodes a selection part by part into a new entry; does nothing if the entry exists at the end.
+def entry_problem(entry: Path, record: EntryRecord, *, limit: int | None = None) -> str | None:
+    """Why an entry is damaged, in words; None if nothing is found.
 
     Args:
-        folder: the cache.
-        entry: folder of the entry.
+        entry: its folder.
+        record: its record.
+        limit: a table above this size, in bytes, is not hashed if its seal holds; None hashes every table.
+    """
+    contents = {}
+    for name, wanted in ((EPISODES, record.episodes_sha256), (BLOCKS, record.blocks_sha256)):
+        contents[name] = (entry / name).read_bytes() if (entry / name).is_file() else b""
+        if sha256(contents[name]) != wanted:
+            return f"{name} is not the file that was written"
+    try:
+        seal = TableSeal.of(entry / ROWS)
+    except FileNotFoundError:
+        return f"{ROWS} is missing"
+    if seal.size != 4 * record.shape[0] * record.shape[1]:
+        return f"{ROWS} has {seal.size} bytes"
+    if seal == record.seal and limit is not None and seal.size > limit:
+        return None
+    return table_problem(entry / ROWS, np.frombuffer(contents[BLOCKS], dtype=BLOCK))
+
+
+def write_entry(staged: Path, selection: "Selection") -> PackedRows:
+    """Decodes a selection part by part into a staged folder that holds a file of zeros for the table.
+
+    Args:
+        staged: the folder; its name is the entry's key.
         selection: the selection.
 
+    Returns:
+        The rows, with the entry locked; they stay valid when the folder is renamed.
+
     Raises:
-        StorageError: the operating system refuses a file operation; nothing is published.
-        StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
+        StorageError: the operating system refuses a file operation.
+        StoreError: arrays cannot be decoded, do not form episodes, or are not those of the part's record.
     """
     plan = plan_rows(selection)
     shape = table_shape(selection, plan)
-    make_folders(folder / STAGING)
-    make_folders(entry.parent)
-    staged = folder / STAGING / f"{entry.name}.{uuid.uuid4().hex}"
-    with lock_file(staged.with_name(f"{staged.name}.lock"), "this entry") as lock:
-        try:
-            with named_errors(staged):
-                disk.make_folder(staged)
-                lengths = _write_rows(staged / ROWS, plan, shape)
-            episodes = Episodes.of(lengths, [part.task for part in plan])
-            tables = (episodes.starts, episodes.lengths, episodes.task_ranges)
-            data = b"".join(table.astype(np.int64).tobytes() for table in tables)
-            record = EntryRecord(
-                format=FORMAT,
-                environment=selection.dataset.name,
-                root=selection.dataset.manifest.root,
-                selection=selected(selection),
-                shape=shape,
-                episodes=len(episodes.starts),
-                episodes_sha256=sha256(data),
-            )
-            write_file(staged / EPISODES, data)
-            text = canonical_json(record.model_dump(mode="json"))
-            write_file(staged / RECORD, sha256(text).encode() + b"\n" + text)
-            with named_errors(staged):
-                disk.sync(staged)
-            move_into_place(staged, entry)
-        finally:
-            remove_tree(staged)
-            lock.unlink(missing_ok=True)
+    with named_errors(staged):
+        lengths, blocks = write_table(staged / ROWS, plan, shape)
+        episodes = Episodes.of(lengths, [part.task for part in plan])
+        record = _write_small_files(staged, selection, episodes, blocks, shape)
+        with contextlib.ExitStack() as lock:
+            file = lock.enter_context((staged / RECORD).open("rb"))
+            take_shared_lock(file)
+            disk.sync(staged)
+            return _map_rows(staged, record, selection, lock.pop_all())
 
 
-def _write_rows(file: Path, plan: Sequence[PartRows], shape: tuple[int, int]) -> list[Indices]:
-    """Writes the table part by part, so that only the parts being read are in memory."""
-    with file.open("xb", buffering=0) as out:
-        out.truncate(4 * shape[0] * shape[1])
-
-        def write(part: PartRows) -> Indices:
-            rows: Table = np.zeros((part.last - part.first, shape[1]), dtype=np.float32)
-            lengths = read_part(part, rows)
-            remaining, offset = memoryview(rows.data).cast("B"), 4 * shape[1] * part.first
-            while remaining:
-                written = os.pwrite(out.fileno(), remaining, offset)
-                remaining, offset = remaining[written:], offset + written
-            return lengths
-
-        lengths = list(map_parts(plan, write))
-    disk.sync(file)
-    return lengths
+def _write_small_files(
+    staged: Path, selection: "Selection", episodes: Episodes, blocks: Blocks, shape: tuple[int, int]
+) -> EntryRecord:
+    """Writes everything beside the table, the record last."""
+    tables = (episodes.starts, episodes.lengths, episodes.task_ranges)
+    contents = {
+        EPISODES: b"".join(table.astype(np.int64).tobytes() for table in tables),
+        BLOCKS: blocks.tobytes(),
+    }
+    for name, data in contents.items():
+        write_file(staged / name, data)
+    record = EntryRecord(
+        format=FORMAT,
+        key=staged.name,
+        environment=selection.dataset.name,
+        dataset=printable(str(selection.dataset.folder.resolve())),
+        tasks=len(selection.tasks),
+        parts=len(blocks),
+        shape=shape,
+        episodes=len(episodes.starts),
+        episodes_sha256=sha256(contents[EPISODES]),
+        blocks_sha256=sha256(contents[BLOCKS]),
+        seal=TableSeal.of(staged / ROWS),
+    )
+    text = canonical_json(record.model_dump(mode="json"))
+    write_file(staged / RECORD, sha256(text).encode() + b"\n" + text)
+    return record

@@ -1,6 +1,6 @@
 """Packed rows: all selected steps in one float32 table."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.store.arrays import Arrays, checked_offsets, read_arrays
+from tcmrl_data.store.arrays import Arrays, array_digests, checked_offsets, read_arrays
+from tcmrl_data.store.manifest import ArrayRecord
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.selection import Selection
@@ -91,12 +92,14 @@ class PartRows:
         task: position of the part's task in the selection.
         first: its first row.
         last: its last row + 1.
+        records: the part's record of every array.
     """
 
     folder: Path
     task: int
     first: int
     last: int
+    records: Mapping[str, ArrayRecord]
 
 
 def plan_rows(selection: "Selection") -> list[PartRows]:
@@ -123,7 +126,7 @@ def plan_rows(selection: "Selection") -> list[PartRows]:
                         "run `tcmrl-data repair`"
                     )
             last = first + arrays["observations"].shape[0]
-            plan.append(PartRows(folder, position, first, last))
+            plan.append(PartRows(folder, position, first, last, arrays))
             first = last
     return plan
 
@@ -160,17 +163,35 @@ def map_parts(plan: Sequence[PartRows], read: Callable[[PartRows], Any]) -> Iter
         yield from pool.map(read, plan)
 
 
-def read_part(part: PartRows, out: Table) -> Indices:
+def read_part(part: PartRows, out: Table, *, check_digests: bool = False) -> Indices:
     """Reads a part into rows of zeros; returns the lengths of its episodes.
 
+    Args:
+        part: the part.
+        out: (observations, width), the part's rows.
+        check_digests: hash the decoded arrays and compare them with the part's record; for rows that others
+            receive under the part's id.
+
     Raises:
-        StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
+        StoreError: arrays cannot be decoded, do not form episodes, or are not those of the part's record;
+            the message names the part.
     """
     arrays = read_arrays(part.folder, ROW_ARRAYS)
+    if check_digests:
+        _check_digests(part, arrays)
     try:
         return fill_rows(out, arrays)
     except StoreError as error:
         raise StoreError(f"{part.folder}: {error}; run `tcmrl-data repair`") from None
+
+
+def _check_digests(part: PartRows, arrays: Arrays) -> None:
+    for name, found in array_digests(arrays).items():
+        record = part.records[name]
+        if found != {"dtype": record.dtype, "shape": list(record.shape), "sha256": record.sha256}:
+            raise StoreError(
+                f"{part.folder}: {name} is not the array that part.json records; run `tcmrl-data repair`"
+            )
 
 
 def fill_rows(out: Table, arrays: Arrays) -> Indices:
