@@ -1,12 +1,16 @@
 """Clusters: machines that are lost or too small, and connections that fail."""
 
+import contextlib
+import dataclasses
 import os
 import re
 import signal
+import subprocess
 import sys
 import uuid
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +18,26 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, Recipe, load_recipe
+from tcmrl_data.build import nodes
+from tcmrl_data.build.nodes import WORKER as NODE_WORKER
+from tcmrl_data.build.nodes import check_nodes
+from tcmrl_data.build.plan import plan_build
 from tcmrl_data.engine.base import ATTEMPTS, Unit
 from tcmrl_data.engine.ray import RayEngine
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.store.manifest import read_manifest
 from tests.conftest import TASKS, TINY
 from tests.directed import Directions
-from tests.workers import PATIENCE, ancestors, command_line, marked_pids, wait_for, worker_pids
+from tests.disks import small_disk
+from tests.workers import (
+    PATIENCE,
+    ancestors,
+    command_line,
+    marked_pids,
+    other_version,
+    wait_for,
+    worker_pids,
+)
 
 loopback = pytest.mark.loopback
 
@@ -103,6 +120,64 @@ def test_a_supervisor_that_is_killed_is_replaced_by_ray(
     assert len(directions.waiting()) > ATTEMPTS
     assert (report.failed, report.built) == ((), 3)
     assert ids(out) == ids(tiny_folder, 0)
+
+
+@contextlib.contextmanager
+def machine_started_by(ray_cluster: Any, *prefix: str) -> Iterator[None]:
+    """A further machine with four cores, all whose processes a command starts."""
+    before = len(live_machines())
+    command = [sys.executable, "-m", "ray.scripts.scripts", "start", f"--address={ray_cluster.address}"]
+    command += ["--num-cpus=4", "--object-store-memory=80000000", "--block"]
+    with subprocess.Popen(
+        [*prefix, *command], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    ) as machine:
+        wait_for(lambda: len(live_machines()) > before or machine.poll() is not None, "the machine")
+        try:
+            yield
+        finally:
+            machine.terminate()
+
+
+def live_machines() -> list[str]:
+    """Ids of the cluster's machines."""
+    import ray
+
+    return [node["NodeID"] for node in ray.nodes() if node["Alive"]]
+
+
+@loopback
+def test_a_unit_runs_once_on_every_machine_that_could_run_it(
+    ray_cluster: Any, second_machine: Any, tmp_path: Path
+) -> None:
+    small = ray_cluster.add_node(num_cpus=1)
+    spec = {"token": str(tmp_path), "deadline": 0.0, "tcmrl": "other"}
+    unit = Unit("check", spec, NODE_WORKER, cpus=2, timeout=PATIENCE)
+    engine = RayEngine(address=ray_cluster.address)
+    reports = engine.run_on_every_node(unit)
+    expected = [{"kind": "node", "sees_folder": True, "tcmrl": version("tcmrl")}]
+    assert [(list(report.messages), report.error) for report in reports] == [(expected, None)] * 2
+    failed = engine.run_on_every_node(dataclasses.replace(unit, worker="tcmrl_data.nothing"))
+    ray_cluster.remove_node(small)
+    assert all("No module named tcmrl_data.nothing" in str(report.error) for report in failed)
+
+
+@loopback
+def test_machines_without_the_folder_or_with_other_versions_are_refused_before_any_unit_starts(
+    ray_cluster: Any, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(nodes, "FOLDER_SECONDS", 0.1)
+    shared = tmp_path / "shared"
+    shared.mkdir()
+    elsewhere = ["unshare", "--mount", "sh", "-c", f'{small_disk(shared, 1_000)} && exec "$@"', "sh"]
+    other = ray_cluster.add_node(num_cpus=4, env_vars=other_version(tmp_path, "numpy"))
+    plan, engine = plan_build(tiny_recipe, tasks=[3]), RayEngine(address=ray_cluster.address)
+    with machine_started_by(ray_cluster, *elsewhere), pytest.raises(BuildError) as error:
+        check_nodes(engine, plan, shared / "data")
+    ray_cluster.remove_node(other)
+    told = str(error.value).split("; ")
+    assert any(re.fullmatch(rf"node \S+ \(\S+\) does not see {shared}/data", line) for line in told)
+    assert any(re.fullmatch(r"node \S+ \(\S+\) has other versions \(numpy 0.0.7 .*\)", line) for line in told)
+    assert len(told) == 4
 
 
 @loopback

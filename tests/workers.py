@@ -99,3 +99,12 @@ def _read(pid: int, name: str) -> bytes:
         return Path(f"/proc/{pid}/{name}").read_bytes()
     except OSError:  # it has ended
         return b""
+
+
+def other_version(folder: Path, package: str) -> dict[str, str]:
+    """Variables under which processes find version 0.0.7 of a package; writes its metadata below a folder."""
+    place = folder / f"other-{package}"
+    metadata = place / f"{package}-0.0.7.dist-info" / "METADATA"
+    metadata.parent.mkdir(parents=True)
+    metadata.write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 0.0.7\n")
+    return {"PYTHONPATH": os.pathsep.join([str(place), str(ROOT)])}

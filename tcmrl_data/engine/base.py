@@ -63,6 +63,21 @@ class Result:
     node: str
 
 
+@dataclass(frozen=True)
+class NodeReport:
+    """What a unit told that ran on one of an engine's machines.
+
+    Attributes:
+        node: name and address of the machine.
+        messages: the unit's messages, in order; all of them if there is no error.
+        error: one line, if the unit did not end well there.
+    """
+
+    node: str
+    messages: tuple[Mapping[str, Any], ...]
+    error: str | None
+
+
 class BaseEngine(abc.ABC):
     """Runs every unit at least once, in any order; a plug-in of the entry point group `tcmrl.engines`.
 
@@ -90,6 +105,19 @@ class BaseEngine(abc.ABC):
         Raises:
             BuildError: a unit needs more resources than any machine has; no unit was started.
         """
+
+    def run_on_every_node(self, unit: Unit) -> Sequence[NodeReport]:
+        """Runs a unit once on every other machine that could run it, to compare the machines.
+
+        An engine that uses this machine alone has none to compare.
+
+        Args:
+            unit: one that has a timeout; its resources choose the machines and are not reserved.
+
+        Raises:
+            BuildError: the machines cannot be reached.
+        """
+        return ()
 
 
 ENGINES = Registry("tcmrl.engines", "engine", BaseEngine)

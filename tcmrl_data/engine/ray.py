@@ -14,7 +14,7 @@ from collections.abc import Generator, Iterator, Mapping, Sequence
 from typing import Any, final
 
 from tcmrl_data.engine._attempt import GRACE_SECONDS, Outcome, run_attempt
-from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
+from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, NodeReport, Result, Unit, longest_first
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.sizes import size
@@ -24,6 +24,9 @@ LOST_RETRIES = 3
 
 POLL_SECONDS = 0.2
 CONNECT_SECONDS = 10.0
+NODE_SECONDS = 60.0
+"""Ray may take this long to start a process on a machine, beside the time of the unit."""
+
 OBJECT_STORE_BYTES = 100_000_000
 """Object store of a local cluster. Only digests pass through it; Ray's default is 30 % of the memory."""
 
@@ -44,6 +47,14 @@ class RayEngine(BaseEngine):
                 yield from run.results(on_message)
             finally:
                 run.stop()
+
+    def run_on_every_node(self, unit: Unit) -> Sequence[NodeReport]:
+        """One report per machine of the cluster; none for a cluster that is yet to be started here."""
+        ray = _import_ray()
+        if self.address is None and not ray.is_initialized():
+            return ()
+        with _connection(ray, self.workers, self.address):
+            return _run_on_every_node(ray, unit)
 
 
 class _Run:
@@ -97,8 +108,7 @@ class _Run:
         try:
             outcome, node = self._ray.get(reference)
         except self._ray.exceptions.RayError as error:
-            reason = str(getattr(error, "cause", None) or error).strip().splitlines()
-            return Outcome(crash=reason[0] if reason else type(error).__name__), "the cluster"
+            return Outcome(crash=_reason(error)), "the cluster"
         return outcome, node
 
     def _messages(self) -> list[tuple[str, Mapping[str, Any]]]:
@@ -143,6 +153,51 @@ def _supervise(unit: Unit, mailbox: Any) -> tuple[Outcome, str]:
             mailbox.put.remote(unit.id, message)
 
     return run_attempt(unit, on_message, threading.Event()), socket.gethostname()
+
+
+def _run_on_every_node(ray: Any, unit: Unit) -> list[NodeReport]:
+    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+    nodes = [node for node in ray.nodes() if node["Alive"] and _fits(node["Resources"], unit)]
+    running = []
+    for node in nodes:
+        there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+        task = ray.remote(_attempt_once).options(
+            name=unit.id, num_cpus=0, max_retries=0, scheduling_strategy=there
+        )
+        running.append(task.remote(unit))
+    patience = (unit.timeout or 0.0) + NODE_SECONDS
+    ended, late = ray.wait(running, num_returns=len(running), timeout=patience) if running else ([], [])
+    for reference in late:
+        ray.cancel(reference, force=True)
+    return [
+        _node_report(ray, node, reference if reference in ended else None, patience)
+        for node, reference in zip(nodes, running, strict=True)
+    ]
+
+
+def _node_report(ray: Any, node: Mapping[str, Any], reference: Any, patience: float) -> NodeReport:
+    """What a machine answered; without a reference, that it did not."""
+    name = f"{node['NodeManagerHostname']} ({node['NodeManagerAddress']})"
+    if reference is None:
+        return NodeReport(name, (), f"no answer within {patience:g} s")
+    try:
+        outcome, messages = ray.get(reference)
+    except ray.exceptions.RayError as error:
+        return NodeReport(name, (), _reason(error))
+    return NodeReport(name, tuple(messages), outcome.error or outcome.crash)
+
+
+def _attempt_once(unit: Unit) -> tuple[Outcome, list[Mapping[str, Any]]]:
+    """Runs one attempt on a machine of the cluster; returns its outcome and its messages."""
+    messages: list[Mapping[str, Any]] = []
+    return run_attempt(unit, messages.append, threading.Event()), messages
+
+
+def _reason(error: Exception) -> str:
+    """The first line of the cause of an error of Ray's."""
+    lines = str(getattr(error, "cause", None) or error).strip().splitlines()
+    return lines[0] if lines else type(error).__name__
 
 
 def _import_ray() -> Any:
@@ -214,13 +269,21 @@ def _refuse_unplaceable(nodes: Sequence[Mapping[str, Any]], units: Sequence[Unit
     """
     machines = [node["Resources"] for node in nodes if node["Alive"]]
     for unit in units:
-        needed = {"CPU": unit.cpus, "GPU": unit.gpus, "memory": unit.memory}
-        if not any(all(machine.get(name, 0) >= needed[name] for name in needed) for machine in machines):
+        if not any(_fits(machine, unit) for machine in machines):
             present = "; ".join(sorted({_resources(machine) for machine in machines}))
             raise BuildError(
-                f"{unit.id} needs {_resources(needed)}, more than any machine of the cluster has "
+                f"{unit.id} needs {_resources(_needed(unit))}, more than any machine of the cluster has "
                 f"({present}); lower build.cpus, build.gpus or build.memory with --set, or add a machine"
             )
+
+
+def _fits(machine: Mapping[str, float], unit: Unit) -> bool:
+    """A machine with these resources could run the unit if it had nothing else to do."""
+    return all(machine.get(name, 0) >= amount for name, amount in _needed(unit).items())
+
+
+def _needed(unit: Unit) -> dict[str, float]:
+    return {"CPU": unit.cpus, "GPU": unit.gpus, "memory": unit.memory}
 
 
 def _resources(resources: Mapping[str, float]) -> str:
