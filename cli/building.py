@@ -151,6 +151,11 @@ def plan(
     help="Seed of behavior training and rollouts; tasks and split do not depend on it.",
 )
 @click.option(
+    "--drop-tasks",
+    metavar="LIST",
+    help="Indices of tasks that the dataset is to do without, such as one whose training diverges.",
+)
+@click.option(
     "--ray-address",
     metavar="ADDRESS",
     show_default="a new local cluster",
@@ -168,6 +173,7 @@ def build(
     quiet: bool,
     out: Path | None,
     seed: int,
+    drop_tasks: str | None,
     ray_address: str | None,
 ) -> None:
     """Build a dataset, or the missing parts of one.
@@ -175,14 +181,16 @@ def build(
     ENV is an environment with a recipe, and FILE is a recipe of your own. FILE ends in .toml and names its
     environment in the table [environment].
 
-    A complete dataset is verified and not changed. If a build was stopped, the same command continues it.
-    With other indices in --tasks, the command adds tasks to the dataset.
+    A complete dataset is not changed. If a build was stopped, the same command continues it. With other
+    indices in --tasks, the command adds tasks to the dataset. The parts of tasks in --drop-tasks stay on disk
+    but no longer belong to the dataset, until a build names the tasks in --tasks.
 
     \b
     Examples:
       tcmrl-data build point-robot --profile quick
       tcmrl-data build half-cheetah-vel --tasks 0-9 --workers 4 --out data/cheetah
       tcmrl-data build ml1/reach --behavior scripted --set rollouts.episodes=20
+      tcmrl-data build point-robot --drop-tasks 6
       tcmrl-data build my-recipe.toml --profile quick
     """
     import tcmrl_data
@@ -196,6 +204,7 @@ def build(
             out,
             seed=seed,
             tasks=chosen,
+            dropped=_parse_tasks(recipe, drop_tasks, option="--drop-tasks") or (),
             workers=workers,
             engine=engine,
             address=ray_address,
@@ -214,10 +223,10 @@ def build(
         fail_incomplete(f"{report.failed[0]}{more}; run the same command again to build the missing parts")
 
 
-def _parse_tasks(recipe: "Recipe", text: str | None) -> list[int] | None:
+def _parse_tasks(recipe: "Recipe", text: str | None, *, option: str = "--tasks") -> list[int] | None:
     import tcmrl_data
 
-    return None if text is None else tcmrl_data.parse_indices(text, recipe.environment.tasks)
+    return None if text is None else tcmrl_data.parse_indices(text, recipe.environment.tasks, option=option)
 
 
 def _show(event: "BuildEvent", progress: StageProgress) -> None:

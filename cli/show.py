@@ -54,9 +54,7 @@ def _rows(document: dict[str, Any]) -> dict[str, str]:
         "size": size(document["bytes"]),
         "root": document["root"],
     }
-    if made["created"]:
-        rows["built"] = " to ".join(dict.fromkeys((made["created"][0], made["created"][-1])))
-    labels = {"cpu": "CPU", "platform": "platform", "packages": "packages"}
+    labels = {"cpu": "CPU", "system": "system", "packages": "packages"}
     return rows | {label: "; ".join(made[key]) for key, label in labels.items() if made[key]}
 
 

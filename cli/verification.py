@@ -61,7 +61,10 @@ def verify(dataset: Path, as_json: bool, quiet: bool, quick: bool, deep: bool, r
         for finding in report.findings:
             click.echo(f"{printable(finding.file)}: {printable(finding.problem)}")
         for replayed in report.replays:
-            how = "bit for bit" if replayed.exact else "within the tolerance for another platform"
+            differences = "; ".join(replayed.platform_differences)
+            how = (
+                f"within the tolerance for another platform ({differences})" if differences else "bit for bit"
+            )
             result = "differs" if replayed.problems else "is equal"
             click.echo(f"replay of task {replayed.task}, step {replayed.step}: {result}, compared {how}")
         click.echo(
@@ -105,15 +108,15 @@ def repair(dataset: Path, as_json: bool, quiet: bool, deep: bool, workers: int |
     if as_json:
         print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
     else:
-        for task, step in report.repaired:
-            click.echo(f"task {task}, step {step}: regenerated, same id")
-        for file in report.groups:
-            click.echo(f"{file}: rewritten")
+        for key in report.repaired:
+            click.echo(f"{key}: regenerated, same id")
+        for table in report.tables:
+            click.echo(f"{table}: written again from the parts, same root")
         for finding in report.left:
             click.echo(f"{printable(finding.file)}: kept, {printable(finding.problem)}")
         click.echo(
             f"{printable(str(report.dataset))}: {len(report.repaired):,} parts regenerated, "
-            f"{len(report.groups):,} group records rewritten, {_count(report.left)} not repaired"
+            f"{len(report.tables):,} tables rewritten, {_count(report.left)} not repaired"
             f"{'; the folder cannot be written, and no write was needed' if report.read_only else ''}"
         )
     if report.failed:

@@ -4,19 +4,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, final
+from typing import TYPE_CHECKING, Annotated, Literal, Protocol, final
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from tcmrl_data.envs.base import Environment, Parameters
 from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json, sha256
 from tcmrl_data.foundation.disk import make_folders, write_tree
-from tcmrl_data.foundation.errors import SnapshotError
-from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
+from tcmrl_data.foundation.errors import SnapshotError, StoreError
+from tcmrl_data.foundation.plain_files import one_line, printable
 
 if TYPE_CHECKING:
     import torch
@@ -67,6 +67,13 @@ PolicyDescription = Annotated[GaussianDescription | ScriptedDescription, Field(d
 _DESCRIPTION: TypeAdapter[GaussianDescription | ScriptedDescription] = TypeAdapter(PolicyDescription)
 
 
+class ReadFile(Protocol):
+    """Reads a file by its name."""
+
+    def __call__(self, name: str, *, limit: int) -> bytes:
+        """The content of a file of at most `limit` bytes."""
+
+
 @dataclass(frozen=True)
 class Snapshot:
     """A behavior policy of one task at one training step.
@@ -112,36 +119,42 @@ class Snapshot:
         return files
 
 
-def read_snapshot(folder: Path, step: int) -> Snapshot:
-    """Reads the snapshot in a part's folder.
+def read_snapshot(read: ReadFile, step: int, *, place: str) -> Snapshot:
+    """Reads a snapshot.
+
+    Args:
+        read: reads a file of the snapshot.
+        step: the snapshot's.
+        place: where the files lie, for error messages.
 
     Raises:
         SnapshotError: a file is missing or malformed, tensors do not have the names, shapes and dtypes of
             the description, or weights are not finite.
     """
     try:
-        values = parse_json(read_plain_file(folder / "policy.json", limit=DESCRIPTION_BYTES))
+        values = parse_json(read("policy.json", limit=DESCRIPTION_BYTES))
         description = _DESCRIPTION.validate_json(canonical_json(values))
-    except (OSError, ValueError, ValidationError) as error:
-        raise SnapshotError(
-            f"{folder / 'policy.json'}: not a policy description ({one_line(error)})"
-        ) from None
+    except (OSError, ValueError, StoreError) as error:
+        raise SnapshotError(f"{place}: policy.json: not a policy description ({one_line(error)})") from None
     if isinstance(description, ScriptedDescription):
         return Snapshot(step, description)
-    return Snapshot(step, description, _read_tensors(folder / "policy.safetensors", description.shapes()))
+    return Snapshot(step, description, _read_tensors(read, place, description.shapes()))
 
 
-def _read_tensors(file: Path, shapes: Mapping[str, tuple[int, ...]]) -> dict[str, npt.NDArray[np.float32]]:
+def _read_tensors(
+    read: ReadFile, place: str, shapes: Mapping[str, tuple[int, ...]]
+) -> dict[str, npt.NDArray[np.float32]]:
     from safetensors import SafetensorError
     from safetensors.numpy import load
 
+    file = f"{place}: policy.safetensors"
     weights = sum(int(np.prod(shape)) for shape in shapes.values())
     try:
-        data = read_plain_file(file, limit=4 * weights + HEADER_BYTES)
+        data = read("policy.safetensors", limit=4 * weights + HEADER_BYTES)
         if len(data) < 4 * weights:
             raise SnapshotError(f"{file}: {len(data)} bytes, the policy needs {4 * weights}")
         tensors = load(data)
-    except (OSError, ValueError, KeyError, TypeError, SafetensorError) as error:
+    except (OSError, ValueError, KeyError, TypeError, StoreError, SafetensorError) as error:
         raise SnapshotError(f"{file}: cannot be read as safetensors ({one_line(error)})") from None
     found = {name: array.shape for name, array in tensors.items()}
     if found != dict(shapes):

@@ -8,20 +8,25 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.build.driver import Driver
-from tcmrl_data.build.events import EVENTS, BuildEvent, EventLog
+from tcmrl_data.build.events import BuildEvent, EventLog
+from tcmrl_data.build.ledger import Ledger
 from tcmrl_data.build.plan import plan_build
-from tcmrl_data.build.work_files import check_work_files
+from tcmrl_data.build.work_files import WORK_FILES, WORK_FOLDERS, check_work_files
 from tcmrl_data.engine.base import ENGINES
-from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_file, make_folders, remove_abandoned
+from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
 from tcmrl_data.foundation.sizes import size
-from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.store.manifest import DATA_VERSION, MANIFEST, read_manifest
+from tcmrl_data.recipe.recipe import Recipe, full_settings
+from tcmrl_data.store.keys import PARTS
+from tcmrl_data.store.manifest import MANIFEST, read_manifest
+from tcmrl_data.store.part_record import DATA_VERSION
+from tcmrl_data.store.part_table import PARTS_TABLE
+from tcmrl_data.store.task_table import TASKS
 
 SEEDS = 2**63
 """Seeds are stored as int64, in exports too."""
 
-OWN_FILES = {MANIFEST, LOCK, STAGING, CHECKPOINTS, EVENTS, "zarr.json", "tasks"}
+OWN_FILES = {MANIFEST, TASKS, PARTS_TABLE, PARTS} | WORK_FILES | WORK_FOLDERS
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,7 @@ def build_dataset(
     *,
     seed: int = 0,
     tasks: Sequence[int] | None = None,
+    dropped: Sequence[int] = (),
     workers: int | None = None,
     engine: str = "local",
     address: str | None = None,
@@ -63,6 +69,8 @@ def build_dataset(
         out: dataset folder: new, empty, or a dataset of the same recipe and seed, which is extended.
         seed: root seed of behavior training and rollouts.
         tasks: indices of the full task set instead of the profile's choice.
+        dropped: indices of tasks that the dataset is to do without; their parts stay on disk, and a later
+            build that names them in `tasks` takes them up again.
         workers: units run at the same time; as many as the engine has cores where None.
         engine: an engine's name.
         address: of the engine's cluster, where it has one.
@@ -79,30 +87,31 @@ def build_dataset(
     if not 0 <= seed < SEEDS:
         raise BuildError(f"seed {seed} is not in [0, 2**63); choose a smaller --seed")
     runner = ENGINES.get(engine)(workers, address=address)
-    plan = plan_build(recipe, seed=seed, tasks=tasks)
+    plan = plan_build(recipe, seed=seed, tasks=tasks, dropped=dropped)
     _check_folder(out, recipe, seed)
+    plan.check_limits()
     make_folders(out)
     failed: tuple[str, ...] = ()
     read_only = False
     try:
         with lock_file(out / LOCK, f"dataset {out}"):
             remove_abandoned(out)
-            driver = Driver(plan.with_tasks(_earlier_tasks(out)), out)
-            _check_space(out, driver.missing_parts * plan.part_bytes, driver.missing_parts)
-            present = len(driver.parts)
-            if driver.missing_parts:
+            ledger = Ledger(plan, out, taken_up=tasks or ())
+            ledger.plan.check_limits()
+            _check_space(out, ledger.num_missing * plan.part_bytes, ledger.num_missing)
+            present = ledger.num_parts
+            if ledger.num_missing:
                 with EventLog(out, progress) as log:
-                    failed = driver.run(runner, log)
-            else:
-                driver.write_manifest()
+                    failed = Driver(ledger, out.resolve()).run(runner, log)
+            elif not ledger.is_sealed():
+                ledger.begin()
     except ReadOnlyError:
-        driver = Driver(plan.with_tasks(_earlier_tasks(out)), out)
-        present, read_only = len(driver.parts), True
-        if not driver.is_finished():
+        ledger = Ledger(plan, out, taken_up=tasks or ())
+        present, read_only = ledger.num_parts, True
+        if ledger.num_missing or not ledger.is_sealed():
             raise
     seconds = time.monotonic() - started
-    built = len(driver.parts) - present
-    return BuildReport(out, built, present, failed, seconds, driver.root, read_only)
+    return BuildReport(out, ledger.num_parts - present, present, failed, seconds, ledger.root, read_only)
 
 
 def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
@@ -116,13 +125,17 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
     if not is_dataset:
         return
     manifest = read_manifest(out)
+    if manifest.derivation is not None or manifest.runs[0].kind != "built":
+        raise BuildError(f"{out} was derived from other datasets and cannot be built; use another --out")
     if manifest.data_version != DATA_VERSION:
         raise BuildError(
             f"{out} has data version {manifest.data_version}, not {DATA_VERSION}; use another --out"
         )
     if manifest.seed != seed:
         raise BuildError(f"{out} was built with seed {manifest.seed}, not {seed}; use another --out")
-    other = _first_difference(manifest.recipe.unit_settings(), recipe.unit_settings())
+    other = _first_difference(
+        full_settings(manifest.recipe.unit_settings()), full_settings(recipe.unit_settings())
+    )
     if other:
         raise BuildError(f"{out} was built with other settings: {other}; use another --out")
 
@@ -135,11 +148,6 @@ def _first_difference(old: Any, new: Any, path: str = "") -> str | None:
                 return found
         return None
     return None if old == new else f"{path} is {old} there and {new} here"
-
-
-def _earlier_tasks(out: Path) -> list[int]:
-    """Indices of the tasks that the dataset already has, built or planned."""
-    return [task.index for task in read_manifest(out).tasks] if (out / MANIFEST).is_file() else []
 
 
 def _check_space(out: Path, needed: int, num_parts: int) -> None:

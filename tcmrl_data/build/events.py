@@ -186,7 +186,7 @@ def build_status(dataset: Path) -> BuildStatus:
 
 def _counts(manifest: Manifest) -> tuple[int, int, int]:
     """Numbers of the tasks, the published parts and the wanted parts."""
-    return len(manifest.tasks), len(manifest.parts), len(manifest.tasks) * len(manifest.steps)
+    return manifest.num_tasks, manifest.totals.parts, manifest.num_expected
 
 
 def _latest_build(folder: Path) -> History:

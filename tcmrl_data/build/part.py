@@ -8,28 +8,27 @@ import numpy as np
 
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.provenance import provenance
-from tcmrl_data.engine.worker import Send
+from tcmrl_data.build.published import Published, read_published
 from tcmrl_data.envs.base import Environment, Lanes
 from tcmrl_data.envs.controller import Controller, UniformController
 from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
-from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
-from tcmrl_data.foundation.disk import publish_folder
+from tcmrl_data.foundation.canonical import canonical_json, digest
+from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import BuildError, NondeterminismError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
+from tcmrl_data.store.archive import pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
-from tcmrl_data.store.manifest import (
+from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
+from tcmrl_data.store.part_record import (
     DATA_VERSION,
-    SCHEMA_VERSION,
+    PART_SCHEMA,
+    RECORD,
     ArrayRecord,
-    FileRecord,
     Identity,
     PartRecord,
     References,
-    part_folder,
-    read_part_record,
 )
 from tcmrl_data.store.statistics import statistics
 
@@ -65,33 +64,27 @@ class PartMaker:
             self._lanes.close()
             self._lanes = None
 
-    def publish(self, snapshot: Snapshot, report: Send) -> str:
-        """Publishes the part of a snapshot and returns its id.
+    def publish(self, snapshot: Snapshot) -> Published:
+        """Publishes the part of a snapshot; one that is there already is read and left alone.
 
-        Args:
-            snapshot: the policy.
-            report: told `{"kind": "part", "task", "step", "id"}`.
+        Raises:
+            NondeterminismError: the part that is there was made on an equal platform from another policy.
         """
-        target = self._dataset / part_folder(self.task.index, snapshot.step)
-        if (target / "part.json").is_file():
-            record = read_part_record(target / "part.json")
-            if record.identity.policy != snapshot.digest():
-                raise NondeterminismError(
-                    f"{target}: its policy differs from the one trained now with the same seed"
-                )
-            return record.id
-        part_id, files = self._make(snapshot)
-        if not publish_folder(self._dataset, target, files, attempt=f"task_{self.task.index:05d}"):
-            published = read_part_record(target / "part.json").id
-            if published != part_id:
-                raise NondeterminismError(
-                    f"{target}: published with id {published}, made again with {part_id}"
-                )
-        report({"kind": "part", "task": self.task.index, "step": snapshot.step, "id": part_id})
-        return part_id
+        file = self._dataset / part_file(PartKey(self.task.index, snapshot.step))
+        if not file.exists():
+            record, data = self._make(snapshot)
+            replace_file(file, data, staging=self._dataset / STAGING)
+            return Published.of_record(record, run=MAIN_RUN, archive=data)
+        published, record = read_published(file, MAIN_RUN)
+        same_platform = record.platform.digest() == self._plan.platform.digest()
+        if same_platform and record.identity.policy != snapshot.digest():
+            raise NondeterminismError(
+                f"{file}: its policy differs from the one trained now with the same seed"
+            )
+        return published
 
-    def _make(self, snapshot: Snapshot) -> tuple[str, dict[str, bytes]]:
-        """The id and all files of the snapshot's part."""
+    def _make(self, snapshot: Snapshot) -> tuple[PartRecord, bytes]:
+        """The record and the archive of the snapshot's part."""
         plan, task = self._plan, self.task
         if self._lanes is None:
             self._lanes = plan.environment.lanes(self._parameters)
@@ -146,8 +139,8 @@ def seal_part(
     trajectories: Sequence[Trajectory],
     references: References,
     behavior: Mapping[str, Any],
-) -> tuple[str, dict[str, bytes]]:
-    """The id and all files of a part, `part.json` included.
+) -> tuple[PartRecord, bytes]:
+    """The record and the archive of a part.
 
     Args:
         plan: of the build.
@@ -163,7 +156,6 @@ def seal_part(
         for name, record in array_digests(arrays).items()
     }
     identity = Identity(
-        schema_version=SCHEMA_VERSION,
         data_version=DATA_VERSION,
         settings=plan.recipe.unit_settings(),
         task=task.index,
@@ -173,17 +165,17 @@ def seal_part(
         policy=snapshot.digest(),
         arrays=records,
     )
-    files = encode_arrays(arrays) | snapshot.files()
     record = PartRecord(
-        schema_version=SCHEMA_VERSION,
+        schema_version=PART_SCHEMA,
         id=digest(identity.model_dump(mode="json")),
         identity=identity,
         statistics=statistics(trajectories),
         references=references,
-        files={name: FileRecord(size=len(data), sha256=sha256(data)) for name, data in sorted(files.items())},
-        provenance=dict(provenance(plan.environment, behavior)),
+        behavior=dict(behavior),
+        platform=plan.platform,
     )
-    return record.id, files | {"part.json": canonical_json(record.model_dump(mode="json"))}
+    record_bytes = canonical_json(record.model_dump(mode="json"))
+    return record, pack_archive(encode_arrays(arrays) | snapshot.files() | {RECORD: record_bytes})
 
 
 def roll_out_part(plan: BuildPlan, *, task: Task, snapshot: Snapshot, lanes: Lanes) -> list[Trajectory]:

@@ -6,10 +6,13 @@ from dataclasses import dataclass, replace
 
 from tcmrl_data.behavior.base import BehaviorSource
 from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Task, draw_tasks
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.foundation.errors import TaskError
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import choose_tasks, group_tasks, pick_tasks
+from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
+from tcmrl_data.store.limits import check_plan
 from tcmrl_data.store.platform import Platform, this_platform
+from tcmrl_data.store.task_table import task_line
 
 PROCESS_BYTES = 400 * 2**20
 """A worker beside its data: torch, MuJoCo and Zarr take about 310 MB as measured; the rest is margin."""
@@ -28,27 +31,53 @@ class BuildPlan:
         seed: root seed of behavior training and rollouts.
         environment: the recipe's.
         tasks: the tasks to build, ascending by index.
+        dropped: indices of tasks that are trained with their group, whose rounding would change without them,
+            but of which no parts are made.
     """
 
     recipe: Recipe
     seed: int
     environment: Environment
     tasks: tuple[Task, ...]
+    dropped: frozenset[int] = frozenset()
 
     @classmethod
-    def of_tasks(cls, recipe: Recipe, *, seed: int, tasks: Iterable[Task]) -> "BuildPlan":
+    def of_tasks(
+        cls, recipe: Recipe, *, seed: int, tasks: Iterable[Task], dropped: Iterable[int] = ()
+    ) -> "BuildPlan":
         """The plan of a recipe for tasks that are known already."""
-        return cls(recipe, seed, recipe.make_environment(), _ordered(tasks))
+        return cls(recipe, seed, recipe.make_environment(), _ordered(tasks), frozenset(dropped))
 
-    def with_tasks(self, indices: Iterable[int]) -> "BuildPlan":
-        """The same plan, with further tasks of the environment.
+    @property
+    def wanted(self) -> tuple[Task, ...]:
+        """The tasks of which parts are made."""
+        return tuple(task for task in self.tasks if task.index not in self.dropped)
+
+    def with_recorded(self, tasks: Iterable[Task], *, dropped: Iterable[int]) -> "BuildPlan":
+        """The same plan with the tasks that a dataset has already, as they stand there.
+
+        Args:
+            tasks: the dataset's; they replace tasks of this plan.
+            dropped: indices of those that the dataset has dropped.
+        """
+        recorded = {task.index: task for task in tasks}
+        own = {task.index: task for task in self.tasks}
+        return replace(
+            self, tasks=_ordered((own | recorded).values()), dropped=self.dropped | frozenset(dropped)
+        )
+
+    def check_limits(self) -> None:
+        """Checks that the dataset will not become larger than readers allow.
 
         Raises:
-            TaskError: an index outside the task set.
+            BuildError: names the limit and what exceeds it.
         """
-        wanted = {*indices, *(task.index for task in self.tasks)}
-        tasks = pick_tasks(draw_tasks(self.environment), self.recipe.build, sorted(wanted))
-        return replace(self, tasks=_ordered(tasks))
+        check_plan(
+            tasks=len(self.tasks),
+            parts=len(self.tasks) * len(self.source.steps),
+            columns=max(self.environment.observation_dim, self.environment.action_dim),
+            largest_task=max(len(task_line(task)) for task in self.tasks),
+        )
 
     @functools.cached_property
     def source(self) -> BehaviorSource:
@@ -88,15 +117,23 @@ def _ordered(tasks: Iterable[Task]) -> tuple[Task, ...]:
     return tuple(sorted(tasks, key=lambda task: task.index))
 
 
-def plan_build(recipe: Recipe, *, seed: int = 0, tasks: Sequence[int] | None = None) -> BuildPlan:
+def plan_build(
+    recipe: Recipe, *, seed: int = 0, tasks: Sequence[int] | None = None, dropped: Sequence[int] = ()
+) -> BuildPlan:
     """The plan of a build.
 
     Args:
         recipe: what to build.
         seed: root seed of behavior training and rollouts.
         tasks: indices of the full task set instead of the profile's choice.
+        dropped: indices of tasks of which no parts are made.
 
     Raises:
-        TaskError: an index outside the task set.
+        TaskError: an index outside the task set, or a task that is both named and dropped.
     """
-    return BuildPlan.of_tasks(recipe, seed=seed, tasks=choose_tasks(recipe, tasks))
+    both = {*(tasks or ())} & {*dropped}
+    if both:
+        raise TaskError(f"task {min(both)} is to be built and to be dropped; name it once")
+    chosen = choose_tasks(recipe, tasks)
+    named = {task.index: task for task in [*chosen, *choose_tasks(recipe, dropped)]}
+    return BuildPlan.of_tasks(recipe, seed=seed, tasks=named.values(), dropped=dropped)

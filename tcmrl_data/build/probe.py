@@ -20,7 +20,6 @@ from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.unit import UnitSpec
 from tcmrl_data.engine.worker import Send, serve
 from tcmrl_data.envs.tasks import Task
-from tcmrl_data.store.manifest import part_folder, read_part_record
 
 WARMUP_STEPS = 200
 UPDATE_SECONDS = 6.0
@@ -118,15 +117,13 @@ def _measure_parts(spec: UnitSpec, plan: BuildPlan, task: Task, snapshot: Snapsh
     seconds = []
     with tempfile.TemporaryDirectory(prefix="tcmrl-probe-") as name:
         maker = PartMaker(Path(name), plan, task=task, behavior={})
-        (Path(name) / part_folder(task.index, 0)).parent.mkdir(parents=True)
         for step in (0, 1):
             started = time.monotonic()
-            maker.publish(dataclasses.replace(snapshot, step=step), lambda message: None)
+            found = maker.publish(dataclasses.replace(snapshot, step=step)).entry
             if len(spec.tasks) > 1:
                 maker.close()
             seconds.append((time.monotonic() - started) * batches)
         maker.close()
-        found = read_part_record(Path(name) / part_folder(task.index, 0) / "part.json").statistics
     stretch = plan.environment.settings.horizon * found.episodes / max(1, found.steps)
     return {"first_part": seconds[0], "part": seconds[1], "stretch": stretch}
 

@@ -15,7 +15,9 @@ from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.store.manifest import DATA_VERSION, part_folder, read_part_record
+from tcmrl_data.store.archive import Archive
+from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.store.part_record import DATA_VERSION, read_part_record
 
 
 @dataclass(frozen=True)
@@ -26,13 +28,15 @@ class UnitSpec:
         dataset: folder of the dataset.
         recipe: the resolved recipe.
         seed: root seed of the build.
-        tasks: the unit's tasks.
+        tasks: the unit's tasks, which are trained together.
+        dropped: indices of tasks of which no parts are made.
     """
 
     dataset: Path
     recipe: Recipe
     seed: int
     tasks: tuple[Task, ...]
+    dropped: frozenset[int] = frozenset()
 
     def to_json(self) -> dict[str, Any]:
         """JSON form."""
@@ -41,6 +45,7 @@ class UnitSpec:
             "recipe": self.recipe.model_dump(mode="json"),
             "seed": self.seed,
             "tasks": [[task.index, task.split, dict(task.parameters)] for task in self.tasks],
+            "dropped": sorted(self.dropped),
         }
 
     @classmethod
@@ -48,7 +53,9 @@ class UnitSpec:
         """The inverse of `to_json`."""
         recipe = Recipe.model_validate_json(canonical_json(values["recipe"]))
         tasks = tuple(Task(index, split, parameters) for index, split, parameters in values["tasks"])
-        return cls(Path(values["dataset"]), recipe, values["seed"], tasks)
+        return cls(
+            Path(values["dataset"]), recipe, values["seed"], tasks, frozenset(values.get("dropped", ()))
+        )
 
 
 def run_unit(spec: UnitSpec, report: Send) -> str:
@@ -58,17 +65,18 @@ def run_unit(spec: UnitSpec, report: Send) -> str:
         A digest over the ids of the unit's parts.
 
     Raises:
-        NondeterminismError: a published part of the same task and step has another id.
+        NondeterminismError: a part published on an equal platform has another policy.
     """
-    plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks)
-    folders = {
-        (task.index, step): spec.dataset / part_folder(task.index, step)
-        for task in spec.tasks
-        for step in plan.source.steps
-    }
-    if not all((folder / "part.json").is_file() for folder in folders.values()):
+    plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks, dropped=spec.dropped)
+    if any(_missing_steps(spec, plan.source, task) for task in plan.wanted):
         _make_parts(spec, plan, report)
-    return digest([read_part_record(folder / "part.json").id for folder in folders.values()])
+    keys = [PartKey(task.index, step) for task in plan.wanted for step in plan.source.steps]
+    return digest([_part_id(spec.dataset / part_file(key)) for key in keys])
+
+
+def _part_id(file: Path) -> str:
+    with Archive(file) as archive:
+        return read_part_record(archive).id
 
 
 def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
@@ -82,7 +90,7 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
         report=lambda count: report({"kind": "steps", "count": count}),
         checkpoints=lambda tasks: _checkpoints(spec, plan, tasks, report),
     )
-    wanted = {task.index for task in spec.tasks if _missing_steps(spec, source, task)}
+    wanted = {task.index for task in plan.wanted if _missing_steps(spec, source, task)}
     recorded = source.provenance()
     with contextlib.ExitStack() as stack:
         makers: dict[int, PartMaker] = {}
@@ -92,7 +100,7 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
             if task.index not in makers:
                 makers[task.index] = PartMaker(spec.dataset, plan, task=task, behavior=recorded)
                 stack.callback(makers[task.index].close)
-            makers[task.index].publish(snapshot, report)
+            report(makers[task.index].publish(snapshot).to_message())
             # simulators of many tasks would fill the memory: a group makes them anew for every part
             if snapshot.step == source.steps[-1] or len(wanted) > 1:
                 makers[task.index].close()
@@ -102,9 +110,7 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
 def _missing_steps(spec: UnitSpec, source: BehaviorSource, task: Task) -> list[int]:
     """Snapshot steps of the task that have no published part."""
     return [
-        step
-        for step in source.steps
-        if not (spec.dataset / part_folder(task.index, step) / "part.json").is_file()
+        step for step in source.steps if not (spec.dataset / part_file(PartKey(task.index, step))).exists()
     ]
 
 
@@ -117,7 +123,11 @@ def _checkpoints(spec: UnitSpec, plan: BuildPlan, tasks: Sequence[Task], report:
         "tasks": [task.index for task in tasks],
         "platform": plan.platform.digest(),
     }
-    missing = {task.index: _missing_steps(spec, plan.source, task) for task in tasks}
+    missing = {
+        task.index: _missing_steps(spec, plan.source, task)
+        for task in tasks
+        if task.index not in spec.dropped
+    }
     return CheckpointFolder(
         spec.dataset,
         checkpoint_name(tasks),

@@ -2,7 +2,7 @@
 
 import re
 import stat
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from tcmrl_data.build.events import EARLIER_EVENTS, EVENTS
@@ -10,25 +10,35 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.plain_files import file_problem
+from tcmrl_data.store.keys import PARTS
+from tcmrl_data.store.part_table import PARTS_TABLE
+from tcmrl_data.store.task_table import TASKS
 
 WORK_FOLDERS = {STAGING, CHECKPOINTS}
 WORK_FILES = {LOCK, EVENTS, EARLIER_EVENTS}
 """A verification looks at their kind only, never into them."""
 
+TABLES = {TASKS, PARTS_TABLE}
 
-def check_work_files(folder: Path) -> None:
+
+def check_work_files(folder: Path, *, but: Collection[str] = ()) -> None:
     """Refuses a dataset whose work files or folders are links, which would lead writing out of it.
+
+    Args:
+        folder: the dataset.
+        but: files that may be anything, since they will be replaced and not written into.
 
     Raises:
         BuildError: names the file.
     """
-    for name in sorted(WORK_FILES | WORK_FOLDERS | {"tasks"}):
+    for name in sorted((WORK_FILES | WORK_FOLDERS | TABLES | {PARTS}) - {*but}):
         try:
             status = (folder / name).lstat()
         except FileNotFoundError:
             continue
         is_folder = stat.S_ISDIR(status.st_mode)
-        if (name in WORK_FILES and file_problem(status)) or (name not in WORK_FILES and not is_folder):
+        is_file = name in WORK_FILES | TABLES
+        if file_problem(status) if is_file else not is_folder:
             raise BuildError(f"{folder / name} is not the plain file or folder that a build makes; delete it")
 
 

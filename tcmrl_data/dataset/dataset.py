@@ -1,66 +1,56 @@
-"""Reading: `open_dataset` → `Dataset`; parts are loaded on first use."""
+"""Reading: `open_dataset` → `Dataset`; tables and parts are read when they are first used."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy.typing as npt
 from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import Snapshot, read_snapshot
-from tcmrl_data.dataset.selection import Selection, chosen_steps
+from tcmrl_data.dataset.selection import Selection, chosen_parts
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TaskError, TrajectoryError
 from tcmrl_data.foundation.plain_files import folder_problem
 from tcmrl_data.foundation.validation import first_problem
+from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
-from tcmrl_data.store.layout import ArrayLayout, check_expansion
-from tcmrl_data.store.manifest import (
-    MANIFEST,
-    Manifest,
-    PartRecord,
-    TaskReferences,
-    dataset_folder,
-    part_folder,
-    read_manifest,
-    read_sealed_part,
-)
-from tcmrl_data.store.part_files import check_files
+from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file, part_folder
+from tcmrl_data.store.manifest import MANIFEST, Manifest, dataset_folder, read_manifest
+from tcmrl_data.store.part_files import check_members
+from tcmrl_data.store.part_record import PartRecord, References, read_part_record
+from tcmrl_data.store.part_table import PARTS_TABLE, REFERENCES, PartEntry, PartTable, parse_parts
+from tcmrl_data.store.tables import read_sealed
+from tcmrl_data.store.task_table import TASKS, parse_tasks
 
-if TYPE_CHECKING:
-    pass
+KEPT_RECORDS = 1000
+"""Records of parts that stay in memory, about 10 kB each."""
+
+
+class TaskReferences(References):
+    """Reference scores of one task; `behavior` is the best snapshot's mean return."""
+
+    behavior: float
 
 
 def open_dataset(path: str | Path) -> "Dataset":
     """Opens a dataset, given its folder or its `manifest.json`.
 
-    The manifest's own digests, every file's presence and size, and every `zarr.json` are checked;
-    contents are not hashed.
+    Only the manifest is read. The tables of tasks and parts are read when they are first used, and are
+    checked against the manifest; so is a part's archive. `verify_dataset` checks everything.
 
     Raises:
-        ManifestError: the manifest or a part's record is missing, truncated, edited or of another version.
-        StoreError: a part's file is missing, of another size, linked, outside the allow-list, or a bomb.
+        ManifestError: the manifest is missing, truncated, edited or of another version.
 
     Example:
         >>> dataset = open_dataset("data/point-robot")  # doctest: +SKIP
         >>> dataset.select(split="train", snapshots="last").trajectories(0)  # doctest: +SKIP
     """
     folder = dataset_folder(path)
-    dataset = Dataset(folder, read_manifest(folder))
-    layouts: list[ArrayLayout] = []
-    stored_bytes = 0
-    for entry in dataset.manifest.parts:
-        problem = folder_problem(folder, part_folder(entry.task, entry.step))
-        if problem:
-            raise StoreError(f"{folder / problem[0]} {problem[1]}; run `tcmrl-data repair {folder}`")
-        record = dataset.part(entry.task, entry.step)
-        layouts += check_files(dataset.folder_of(entry.task, entry.step), record)
-        stored_bytes += sum(file.size for file in record.files.values())
-    check_expansion(layouts, stored_bytes, folder)
-    return dataset
+    return Dataset(folder, read_manifest(folder))
 
 
 class Dataset:
@@ -69,19 +59,57 @@ class Dataset:
     Attributes:
         folder: where it lies.
         manifest: its manifest.
-        tasks: its tasks, ascending by index.
     """
 
     def __init__(self, folder: Path, manifest: Manifest) -> None:
         self.folder, self.manifest = folder, manifest
-        self.tasks = tuple(Task(task.index, task.split, task.parameters) for task in manifest.tasks)
-        self._entries = {(entry.task, entry.step): entry for entry in manifest.parts}
-        self._records: dict[tuple[int, int], PartRecord] = {}
+        self._record = functools.lru_cache(KEPT_RECORDS)(self._read_record)
 
     @property
     def name(self) -> str:
         """The environment's name."""
         return self.manifest.name
+
+    @functools.cached_property
+    def recorded_tasks(self) -> tuple[Task, ...]:
+        """The tasks of the table, dropped ones too, ascending by index.
+
+        Raises:
+            ManifestError: the table of tasks is not the one that the manifest seals.
+        """
+        file = self.folder / TASKS
+        return parse_tasks(read_sealed(file, self.manifest.tasks), file)
+
+    @functools.cached_property
+    def recorded_parts(self) -> PartTable:
+        """The parts of the table, those of dropped tasks too.
+
+        Raises:
+            ManifestError: the table of parts is not the one that the manifest seals.
+        """
+        file = self.folder / PARTS_TABLE
+        return parse_parts(read_sealed(file, self.manifest.parts), file)
+
+    @functools.cached_property
+    def tasks(self) -> tuple[Task, ...]:
+        """The dataset's tasks, ascending by index; errors as of `recorded_tasks`."""
+        dropped = set(self.manifest.dropped)
+        return tuple(task for task in self.recorded_tasks if task.index not in dropped)
+
+    @functools.cached_property
+    def parts(self) -> PartTable:
+        """The dataset's parts, as its table describes them.
+
+        Raises:
+            ManifestError: the table of parts is not the one that the manifest seals, or has another root.
+        """
+        file = self.folder / PARTS_TABLE
+        table = self.recorded_parts.without_tasks(self.manifest.dropped)
+        if table.root != self.manifest.root:
+            raise ManifestError(f"{file}: its parts do not have the manifest's root; run `tcmrl-data verify`")
+        if not set(table.runs) <= {run.name for run in self.manifest.runs}:
+            raise ManifestError(f"{file}: names a run that the manifest does not have")
+        return table
 
     @functools.cached_property
     def environment(self) -> Environment:
@@ -113,14 +141,20 @@ class Dataset:
         Raises:
             TaskError: the dataset does not hold it.
         """
-        for task in self.tasks:
-            if task.index == index:
-                return task
-        raise TaskError(f"{self.folder} holds no task {index}; build it with --tasks {index}")
+        task = self._tasks_by_index.get(index)
+        if task is None:
+            raise TaskError(f"{self.folder} holds no task {index}; build it with --tasks {index}")
+        return task
 
-    def snapshots(self, task: int) -> list[int]:
-        """Snapshot steps of a task, ascending."""
-        return sorted(step for index, step in self._entries if index == task)
+    def snapshots(self, task: int, run: str = MAIN_RUN) -> list[int]:
+        """Snapshot steps of a task in a run, ascending."""
+        return [key.step for key in self.parts.keys_of(task) if key.run == run]
+
+    def missing(self, task: int) -> list[PartKey]:
+        """The parts that a task lacks of those that the manifest's runs call for."""
+        present = set(self.parts.keys_of(task))
+        wanted = (PartKey(task, step, run.name) for run in self.manifest.runs for step in run.steps or ())
+        return sorted(set(wanted) - present)
 
     def references(self, task: int) -> TaskReferences:
         """Reference returns of a task: uniform, oracle, scripted, best behavior.
@@ -128,59 +162,94 @@ class Dataset:
         Raises:
             ManifestError: the task is not complete yet.
         """
-        found = self.manifest.references.get(str(task))
-        if found is None:
+        keys = self.parts.keys_of(task)
+        if not keys or self.missing(task):
             raise ManifestError(
                 f"{self.folder}: task {task} is incomplete; finish it with `tcmrl-data build`"
             )
-        return found
+        entries = [self.entry(key) for key in keys]
+        first = {name: getattr(entries[0], name) for name in REFERENCES}
+        return TaskReferences(**first, behavior=max(entry.mean for entry in entries))
 
-    def folder_of(self, task: int, step: int) -> Path:
-        """Folder of a part."""
-        return self.folder / part_folder(task, step)
-
-    def part(self, task: int, step: int) -> PartRecord:
-        """The record of a part, checked against the manifest.
+    def entry(self, key: PartKey) -> PartEntry:
+        """What the table says of a part.
 
         Raises:
             SelectionError: the dataset has no such part.
-            ManifestError: `part.json` is not the file that the manifest names.
         """
-        if (task, step) not in self._entries:
-            raise SelectionError(f"{self.folder} has no part of task {task} at step {step}")
-        if (task, step) not in self._records:
-            file = self.folder_of(task, step) / "part.json"
-            entry = self._entries[task, step]
-            record, sealed = read_sealed_part(file)
-            if sealed != entry.sha256 or record.id != entry.id:
-                raise ManifestError(
-                    f"{file}: is not the record that the manifest names; run `tcmrl-data repair`"
-                )
-            if (record.identity.task, record.identity.step) != (task, step):
-                raise ManifestError(f"{file}: identity.task and identity.step name another part")
-            self._records[task, step] = record
-        return self._records[task, step]
+        entry = self.parts.entry(key)
+        if entry is None:
+            raise SelectionError(f"{self.folder} has no part of {key}")
+        return entry
 
-    def arrays(self, task: int, step: int) -> dict[str, npt.NDArray[Any]]:
-        """All arrays of a part: flat steps, observations with one row more per episode, offsets."""
-        return read_arrays(self.folder_of(task, step), self.part(task, step).identity.arrays)
+    def file_of(self, key: PartKey) -> Path:
+        """The file of a part's archive."""
+        return self.folder / part_file(key)
 
-    def trajectories(self, task: int, step: int) -> list[Trajectory]:
+    def open_part(self, key: PartKey) -> Archive:
+        """Opens a part's archive, to be closed by the caller.
+
+        Raises:
+            SelectionError: the dataset has no such part.
+            StoreError: the archive is missing, damaged, of another size, or reached through a link.
+        """
+        entry = self.entry(key)
+        problem = folder_problem(self.folder, part_folder(key))
+        if problem:
+            raise StoreError(
+                f"{self.folder / problem[0]} {problem[1]}; run `tcmrl-data repair {self.folder}`"
+            )
+        archive = Archive(self.file_of(key))
+        if archive.size != entry.size:
+            archive.close()
+            raise StoreError(
+                f"{archive.path} has {archive.size} bytes instead of {entry.size}; run `tcmrl-data repair`"
+            )
+        return archive
+
+    def part(self, task: int, step: int, run: str = MAIN_RUN) -> PartRecord:
+        """The record of a part; its archive is checked when it is first used.
+
+        Raises:
+            SelectionError: the dataset has no such part.
+            StoreError: the archive does not hold exactly the files that its record calls for.
+            ManifestError: its record is not that of the part that the table names.
+        """
+        return self._record(PartKey(task, step, run))
+
+    def arrays(
+        self, task: int, step: int, run: str = MAIN_RUN, *, names: Iterable[str] | None = None
+    ) -> dict[str, npt.NDArray[Any]]:
+        """Arrays of a part: flat steps, observations with one row more per episode, offsets.
+
+        Args:
+            task: index of the task.
+            step: snapshot step.
+            run: name of the run.
+            names: of the arrays; all where None.
+        """
+        record = self.part(task, step, run)
+        with self.open_part(PartKey(task, step, run)) as archive:
+            return read_arrays(archive, record.identity.arrays if names is None else names)
+
+    def trajectories(self, task: int, step: int, run: str = MAIN_RUN) -> list[Trajectory]:
         """The episodes of a part.
 
         Raises:
             StoreError: arrays that do not decode or do not form episodes.
         """
-        arrays = self.arrays(task, step)
+        arrays = self.arrays(task, step, run)
         try:
             return unpack(arrays)
         except (StoreError, TrajectoryError) as error:
-            raise StoreError(f"{self.folder_of(task, step)}: {error}; run `tcmrl-data repair`") from None
+            file = self.file_of(PartKey(task, step, run))
+            raise StoreError(f"{file}: {error}; run `tcmrl-data repair`") from None
 
-    def snapshot(self, task: int, step: int) -> Snapshot:
+    def snapshot(self, task: int, step: int, run: str = MAIN_RUN) -> Snapshot:
         """The behavior policy of a part."""
-        self.part(task, step)
-        return read_snapshot(self.folder_of(task, step), step)
+        self.part(task, step, run)
+        with self.open_part(PartKey(task, step, run)) as archive:
+            return read_snapshot(archive.read, step, place=str(archive.path))
 
     def select(
         self, *, split: Split | None = None, tasks: Sequence[int] | None = None, snapshots: str = "all"
@@ -206,5 +275,19 @@ class Dataset:
                 f"{self.folder}: no {split or 'such'} tasks in the dataset; build some with --tasks"
             )
         return Selection(
-            self, tuple(chosen), {task.index: chosen_steps(self, task.index, snapshots) for task in chosen}
+            self, tuple(chosen), {task.index: chosen_parts(self, task.index, snapshots) for task in chosen}
         )
+
+    def _read_record(self, key: PartKey) -> PartRecord:
+        with self.open_part(key) as archive:
+            record = read_part_record(archive)
+            if record.id != self.entry(key).id or (record.identity.task, record.identity.step) != key[:2]:
+                raise ManifestError(
+                    f"{archive.path}: is not the part that the manifest names; run `tcmrl-data repair`"
+                )
+            check_members(archive, record)
+        return record
+
+    @functools.cached_property
+    def _tasks_by_index(self) -> dict[int, Task]:
+        return {task.index: task for task in self.tasks}

@@ -31,8 +31,8 @@ def dataset_row(manifest: Manifest, folder: Path) -> dict[str, Any]:
         "profile": manifest.profile,
         "behavior": manifest.recipe.behavior.source,
         "seed": manifest.seed,
-        "tasks": len(manifest.tasks),
-        "parts": len(manifest.parts),
+        "tasks": manifest.num_tasks,
+        "parts": manifest.totals.parts,
         "complete": manifest.complete,
         "root": manifest.root,
     }

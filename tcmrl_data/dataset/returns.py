@@ -12,6 +12,7 @@ import numpy as np
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.store.part_table import PartEntry
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -26,12 +27,12 @@ def return_table(dataset: Dataset, recompute: bool = False) -> dict[str, Any]:
 
     Args:
         dataset: the dataset; of an incomplete one, what is there.
-        recompute: sum the stored rewards instead of reading the parts' records.
+        recompute: sum the stored rewards instead of reading the table of parts.
 
     Returns:
-        `{"name", "environment", "tasks": [{"task", "split", "snapshots": [{"step", "episodes", "steps",
-        "mean", "std", "min", "max", "success_rate"}]}]}`; mean to max are over a snapshot's episodes, std is
-        the population's, success_rate is null without a success signal.
+        `{"name", "environment", "tasks": [{"task", "split", "snapshots": [{"step", "run", "episodes",
+        "steps", "mean", "std", "min", "max", "success_rate"}]}]}`; mean to max are over a snapshot's
+        episodes, std is the population's, success_rate is null without a success signal.
 
     Example:
         >>> import tcmrl_data
@@ -45,8 +46,8 @@ def return_table(dataset: Dataset, recompute: bool = False) -> dict[str, Any]:
                 "task": task.index,
                 "split": task.split,
                 "snapshots": [
-                    {"step": step} | _returns(dataset, task.index, step, recompute)
-                    for step in dataset.snapshots(task.index)
+                    {"step": entry.step, "run": entry.run} | _returns(dataset, entry, recompute)
+                    for entry in dataset.parts.entries_of(task.index)
                 ],
             }
             for task in dataset.tasks
@@ -56,16 +57,15 @@ def return_table(dataset: Dataset, recompute: bool = False) -> dict[str, Any]:
 
 def task_table(dataset: Dataset) -> dict[str, Any]:
     """Parameters and reference returns of every task; references are null while a task is incomplete."""
-    references = dataset.manifest.references
     return _heading(dataset) | {
         "tasks": [
             {
                 "task": task.index,
                 "split": task.split,
                 "parameters": dict(task.parameters),
-                "references": references[str(task.index)].model_dump()
-                if str(task.index) in references
-                else None,
+                "references": None
+                if dataset.missing(task.index)
+                else dataset.references(task.index).model_dump(),
             }
             for task in dataset.tasks
         ]
@@ -73,22 +73,13 @@ def task_table(dataset: Dataset) -> dict[str, Any]:
 
 
 def snapshot_table(dataset: Dataset) -> dict[str, Any]:
-    """Every part: task, split, step, id, episodes, steps and mean return."""
-    rows = []
-    for task in dataset.tasks:
-        for step in dataset.snapshots(task.index):
-            record = dataset.part(task.index, step)
-            rows.append(
-                {
-                    "task": task.index,
-                    "split": task.split,
-                    "step": step,
-                    "id": record.id,
-                    "episodes": record.statistics.episodes,
-                    "steps": record.statistics.steps,
-                    "mean": record.statistics.mean,
-                }
-            )
+    """Every part: task, split, step, run, id, episodes, steps and mean return."""
+    rows = [
+        {"task": task.index, "split": task.split}
+        | {name: getattr(entry, name) for name in ("step", "run", "id", "episodes", "steps", "mean")}
+        for task in dataset.tasks
+        for entry in dataset.parts.entries_of(task.index)
+    ]
     return _heading(dataset) | {"snapshots": rows}
 
 
@@ -105,20 +96,16 @@ def episode_table(dataset: Dataset, *, task: int | None = None, step: int | None
         SelectionError: no part is left.
     """
     tasks = dataset.tasks if task is None else (dataset.task(task),)
-    parts = [
-        (task.index, found)
-        for task in tasks
-        for found in dataset.snapshots(task.index)
-        if step is None or found == step
+    keys = [
+        key for one in tasks for key in dataset.parts.keys_of(one.index) if step is None or key.step == step
     ]
-    if not parts:
-        raise SelectionError(
-            f"{dataset.folder} has no snapshot of step {step}; its steps are {list(dataset.manifest.steps)}"
-        )
+    if not keys:
+        steps = sorted({key.step for one in tasks for key in dataset.parts.keys_of(one.index)})
+        raise SelectionError(f"{dataset.folder} has no snapshot of step {step}; its steps are {steps}")
     rows = [
-        {"task": index, "step": found, "episode": episode} | _episode(trajectory)
-        for index, found in parts
-        for episode, trajectory in enumerate(dataset.trajectories(index, found))
+        {"task": key.task, "step": key.step, "run": key.run, "episode": episode} | _episode(trajectory)
+        for key in keys
+        for episode, trajectory in enumerate(dataset.trajectories(*key))
     ]
     return _heading(dataset) | {"episodes": rows}
 
@@ -161,7 +148,9 @@ def first_disagreement(recorded: dict[str, Any], recomputed: dict[str, Any]) -> 
             for field in RETURN_FIELDS:
                 if not _agree(before[field], after[field]):
                     place = f"task {old['task']} at step {before['step']}"
-                    return f"{place}: {field} is {before[field]} in part.json and {after[field]} in the data"
+                    return (
+                        f"{place}: {field} is {before[field]} in parts.jsonl and {after[field]} in the data"
+                    )
     return None
 
 
@@ -212,7 +201,7 @@ def _draw_split(axes: "Axes", table: dict[str, Any], split: str, color: str) -> 
 
 
 def _draw_references(axes: "Axes", dataset: Dataset) -> None:
-    references = list(dataset.manifest.references.values())
+    references = [dataset.references(task.index) for task in dataset.tasks if not dataset.missing(task.index)]
     for name, line in (("oracle", "--"), ("uniform", ":")):
         values = [value for record in references if (value := getattr(record, name)) is not None]
         if values:
@@ -225,11 +214,10 @@ def _heading(dataset: Dataset) -> dict[str, Any]:
     return {"name": dataset.manifest.name, "environment": dataset.name}
 
 
-def _returns(dataset: Dataset, task: int, step: int, recompute: bool) -> dict[str, Any]:
+def _returns(dataset: Dataset, entry: PartEntry, recompute: bool) -> dict[str, Any]:
     if not recompute:
-        statistics = dataset.part(task, step).statistics
-        return {field: getattr(statistics, field) for field in RETURN_FIELDS}
-    trajectories = dataset.trajectories(task, step)
+        return {field: getattr(entry, field) for field in RETURN_FIELDS}
+    trajectories = dataset.trajectories(*entry.key)
     returns = np.array([trajectory.undiscounted_return for trajectory in trajectories])
     success = [flag for flag in map(_success, trajectories) if flag is not None]
     return {

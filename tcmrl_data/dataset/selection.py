@@ -9,42 +9,45 @@ import numpy as np
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.dataset import Dataset
 
 
-def chosen_steps(dataset: "Dataset", task: int, rule: str) -> tuple[int, ...]:
-    """Snapshot steps of a task that a rule of `Dataset.select` leaves, ascending.
+def chosen_parts(dataset: "Dataset", task: int, rule: str) -> tuple[PartKey, ...]:
+    """Parts of a task that a rule of `Dataset.select` leaves, sorted by step and run.
 
     Raises:
         SelectionError: the task is incomplete, the rule cannot be read, or nothing is left.
     """
-    steps = dataset.snapshots(task)
-    missing = sorted(set(dataset.manifest.steps) - set(steps))
+    missing = [key.step for key in dataset.missing(task)]
     if missing:
         raise SelectionError(
             f"{dataset.folder}: task {task} lacks snapshots {missing}; finish it with `tcmrl-data build`"
         )
+    keys = dataset.parts.keys_of(task)
     match = re.fullmatch(r"all|last|steps>=(\d+)|return>=(0(?:\.\d+)?|1(?:\.0+)?)", rule.replace(" ", ""))
     if match is None:
         raise SelectionError(
             f"snapshots {rule!r}: expected all, last, steps>=N or return>=Q with Q in [0, 1]"
         )
+    chosen = keys
     if rule == "last":
-        steps = steps[-1:]
+        last = {key.run: key.step for key in keys}
+        chosen = [key for key in keys if key.step == last[key.run]]
     elif match[1]:
-        steps = [step for step in steps if step >= int(match[1])]
+        chosen = [key for key in keys if key.step >= int(match[1])]
     elif match[2]:
-        means = {step: dataset.part(task, step).statistics.mean for step in steps}
+        means = {key: dataset.entry(key).mean for key in keys}
         threshold = np.quantile(list(means.values()), float(match[2]))
-        steps = [step for step in steps if means[step] >= threshold]
-    if not steps:
+        chosen = [key for key in keys if means[key] >= threshold]
+    if not chosen:
         raise SelectionError(
             f"{dataset.folder}: snapshots {rule!r} leaves nothing of task {task}, "
-            f"which has {list(dataset.manifest.steps)}"
+            f"which has {[key.step for key in keys]}"
         )
-    return tuple(steps)
+    return tuple(chosen)
 
 
 @dataclass(frozen=True)
@@ -54,15 +57,13 @@ class Selection:
     Attributes:
         dataset: where it comes from.
         tasks: the selected tasks.
-        steps: task index to snapshot steps.
+        parts: task index to the keys of its selected parts.
     """
 
     dataset: "Dataset"
     tasks: tuple[Task, ...]
-    steps: dict[int, tuple[int, ...]]
+    parts: dict[int, tuple[PartKey, ...]]
 
     def trajectories(self, task: int) -> list[Trajectory]:
         """All selected episodes of a task, snapshot by snapshot."""
-        return [
-            trajectory for step in self.steps[task] for trajectory in self.dataset.trajectories(task, step)
-        ]
+        return [trajectory for key in self.parts[task] for trajectory in self.dataset.trajectories(*key)]

@@ -6,41 +6,38 @@ from typing import Any
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.listing import dataset_row
 
-MADE_WITH = ("python", "cpu", "platform", "created")
-
 
 def dataset_summary(dataset: Dataset) -> dict[str, Any]:
-    """What a dataset is, how large it is, and with what it was made.
+    """What a dataset is, how large it is, and on what it was made.
 
     Returns:
         The row of `list_datasets`, and: `description`; `train` and `test` tasks; steps of `snapshots`;
         `parts_total`, parts when complete; `episodes`, `steps`, `bytes`, of what is there; and under
-        `made_with` all values of `packages`, `python`, `cpu`, `platform`, `created` in the parts' records.
+        `made_with` all values of `packages`, `python`, `cpu`, `system` of the platforms.
     """
     manifest = dataset.manifest
-    parts = [dataset.part(entry.task, entry.step) for entry in manifest.parts]
-    made = [part.provenance for part in parts]
+    platforms = manifest.platforms
     return dataset_row(manifest, dataset.folder) | {
         "description": manifest.recipe.about.description,
         "train": len(dataset.train_tasks),
         "test": len(dataset.test_tasks),
-        "snapshots": list(manifest.steps),
-        "parts_total": len(manifest.tasks) * len(manifest.steps),
-        "episodes": sum(part.statistics.episodes for part in parts),
-        "steps": sum(part.statistics.steps for part in parts),
-        "bytes": sum(file.size for part in parts for file in part.files.values()),
+        "snapshots": sorted(set(dataset.parts.columns["step"].tolist()) | {*(manifest.steps or ())}),
+        "parts_total": manifest.num_expected,
+        "episodes": manifest.totals.episodes,
+        "steps": manifest.totals.steps,
+        "bytes": manifest.totals.bytes,
         "made_with": {
-            "packages": _distinct(_versions(record.get("packages")) for record in made),
-            **{key: _distinct(record.get(key) for record in made) for key in MADE_WITH},
+            "packages": _distinct(_versions(platform.packages) for platform in platforms),
+            "python": _distinct(platform.python for platform in platforms),
+            "cpu": _distinct(platform.cpu for platform in platforms),
+            "system": _distinct(platform.system for platform in platforms),
         },
     }
 
 
-def _versions(packages: Any) -> str | None:
-    if not isinstance(packages, dict):
-        return None
+def _versions(packages: dict[str, str]) -> str:
     return ", ".join(f"{name} {version}" for name, version in sorted(packages.items()))
 
 
-def _distinct(values: Iterable[Any]) -> list[str]:
-    return sorted({value for value in values if isinstance(value, str)})
+def _distinct(values: Iterable[str]) -> list[str]:
+    return sorted(set(values))

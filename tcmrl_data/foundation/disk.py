@@ -32,6 +32,13 @@ class Disk:
         with path.open("xb") as file:
             file.write(data)
 
+    def write_at(self, path: Path, offset: int, data: bytes) -> None:
+        """Writes into a file, which is created if it does not exist, without forcing it to disk."""
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC, 0o644)
+        with os.fdopen(descriptor, "wb") as file:
+            file.seek(offset)
+            file.write(data)
+
     def sync(self, path: Path) -> None:
         """Forces a file's content, or a folder's entries, to disk."""
         descriptor = os.open(path, os.O_RDONLY)

@@ -61,7 +61,7 @@ def read_record(
         raise error(f"{file}: {first_problem(problem)}{remedy}") from None
 
 
-def parse_record(kind: type[Kind], values: Any, file: Path, *, version: int) -> Kind:
+def parse_record(kind: type[Kind], values: Any, file: object, *, version: int) -> Kind:
     """Validates parsed JSON strictly as a record of a dataset.
 
     Raises:
@@ -75,7 +75,7 @@ def parse_record(kind: type[Kind], values: Any, file: Path, *, version: int) -> 
         )
     text = canonical_json(values)
     # canonical JSON escapes every character outside printable ASCII, except DEL
-    hidden = _hidden_text(values) if b"\\" in text or b"\x7f" in text else None
+    hidden = hidden_text(values) if b"\\" in text or b"\x7f" in text else None
     if hidden:
         place = printable(hidden)[:200]
         raise ManifestError(f"{file}: {place} holds control characters, which a terminal would obey")
@@ -95,7 +95,7 @@ def _with_tuples(value: Any) -> Any:
     return tuple(map(_with_tuples, value)) if isinstance(value, list) else value
 
 
-def _hidden_text(value: Any, place: str = "") -> str | None:
+def hidden_text(value: Any, place: str = "") -> str | None:
     """The path of the first field whose name or text holds hidden characters."""
     if isinstance(value, str):
         return place if _is_hidden(value, allowed="\n\t") else None
@@ -106,7 +106,7 @@ def _hidden_text(value: Any, place: str = "") -> str | None:
         inner = f"{place}.{key}" if place else str(key)
         if isinstance(key, str) and _is_hidden(key, allowed=""):
             return inner
-        found = _hidden_text(member, inner)
+        found = hidden_text(member, inner)
         if found:
             return found
     return None

@@ -90,13 +90,14 @@ class EntryRecord(BaseModel):
 def entry_key(selection: "Selection") -> str:
     """The name of a selection's entry: a digest of what its rows hold, whatever the dataset claims.
 
-    A part's id is the digest of its identity, which holds the sha256 of every decoded array.
+    A part's id is the digest of its identity, which holds the sha256 of every decoded array. Decoding checks
+    both, so that an entry holds what its key says.
     """
     dataset = selection.dataset
     parts = [
-        (task.index, step, dataset.part(task.index, step).id)
+        (key.task, key.step, dataset.entry(key).id)
         for task in selection.tasks
-        for step in selection.steps[task.index]
+        for key in selection.parts[task.index]
     ]
     environment = dataset.environment
     layout = (*ROW_ARRAYS, environment.observation_dim, environment.action_dim)
@@ -107,7 +108,7 @@ def entry_bytes(selection: "Selection") -> int:
     """The most that a selection's entry takes on disk, in bytes."""
     plan = plan_rows(selection)
     rows, width = table_shape(selection, plan)
-    episodes = sum(part.records["episode_offsets"].shape[0] - 1 for part in plan)
+    episodes = sum(part.episodes for part in plan)
     return (
         4 * rows * width + 16 * (episodes + len(selection.tasks)) + BLOCK.itemsize * len(plan) + RECORD_BYTES
     )

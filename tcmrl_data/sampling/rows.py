@@ -1,9 +1,8 @@
 """Packed rows: all selected steps in one float32 table."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,10 +10,11 @@ import numpy.typing as npt
 
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.store.arrays import Arrays, array_digests, checked_offsets, read_arrays
-from tcmrl_data.store.manifest import ArrayRecord
+from tcmrl_data.store.arrays import Arrays, array_digests, checked_offsets
+from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
+    from tcmrl_data.dataset.dataset import Dataset
     from tcmrl_data.dataset.selection import Selection
 
 Indices = npt.NDArray[np.int64]
@@ -88,45 +88,30 @@ class PartRows:
     """The rows of one part.
 
     Attributes:
-        folder: the part's folder.
+        dataset: the dataset.
+        key: the part.
         task: position of the part's task in the selection.
         first: its first row.
         last: its last row + 1.
-        records: the part's record of every array.
+        episodes: number of its episodes.
     """
 
-    folder: Path
+    dataset: "Dataset"
+    key: PartKey
     task: int
     first: int
     last: int
-    records: Mapping[str, ArrayRecord]
+    episodes: int
 
 
 def plan_rows(selection: "Selection") -> list[PartRows]:
-    """Plans the rows of a selection's parts; reads the parts' records only.
-
-    Raises:
-        StoreError: the observations or actions of a part do not have the environment's width.
-    """
-    dataset, plan, first = selection.dataset, [], 0
-    widths = {
-        "observations": dataset.environment.observation_dim,
-        "actions": dataset.environment.action_dim,
-    }
+    """Plans the rows of a selection's parts; opens no part."""
+    plan, first = [], 0
     for position, task in enumerate(selection.tasks):
-        for step in selection.steps[task.index]:
-            folder, arrays = (
-                dataset.folder_of(task.index, step),
-                dataset.part(task.index, step).identity.arrays,
-            )
-            for name, width in widths.items():
-                if arrays[name].shape[1] != width:
-                    raise StoreError(
-                        f"{folder}: {name} are {arrays[name].shape[1]} wide, {dataset.name} has {width}; "
-                        "run `tcmrl-data repair`"
-                    )
-            last = first + arrays["observations"].shape[0]
-            plan.append(PartRows(folder, position, first, last, arrays))
+        for key in selection.parts[task.index]:
+            entry = selection.dataset.entry(key)
+            last = first + entry.steps + entry.episodes  # an episode has one row more than steps
+            plan.append(PartRows(selection.dataset, key, position, first, last, entry.episodes))
             first = last
     return plan
 
@@ -176,21 +161,23 @@ def read_part(part: PartRows, out: Table, *, check_digests: bool = False) -> Ind
         StoreError: arrays cannot be decoded, do not form episodes, or are not those of the part's record;
             the message names the part.
     """
-    arrays = read_arrays(part.folder, ROW_ARRAYS)
+    arrays = part.dataset.arrays(*part.key, names=ROW_ARRAYS)
     if check_digests:
         _check_digests(part, arrays)
     try:
         return fill_rows(out, arrays)
     except StoreError as error:
-        raise StoreError(f"{part.folder}: {error}; run `tcmrl-data repair`") from None
+        raise StoreError(f"{part.dataset.file_of(part.key)}: {error}; run `tcmrl-data repair`") from None
 
 
 def _check_digests(part: PartRows, arrays: Arrays) -> None:
+    records = part.dataset.part(*part.key).identity.arrays
     for name, found in array_digests(arrays).items():
-        record = part.records[name]
+        record = records[name]
         if found != {"dtype": record.dtype, "shape": list(record.shape), "sha256": record.sha256}:
             raise StoreError(
-                f"{part.folder}: {name} is not the array that part.json records; run `tcmrl-data repair`"
+                f"{part.dataset.file_of(part.key)}: {name} is not the array that part.json records; "
+                "run `tcmrl-data repair`"
             )
 
 
@@ -202,9 +189,14 @@ def fill_rows(out: Table, arrays: Arrays) -> Indices:
         arrays: the part's arrays.
 
     Raises:
-        StoreError: the arrays do not form episodes, or do not have as many observations as `out` has rows.
+        StoreError: the arrays do not form episodes, or do not have the shape of `out`.
     """
     observations, actions = arrays["observations"], arrays["actions"]
+    if observations.shape[1] + actions.shape[1] + 2 != out.shape[1]:
+        raise StoreError(
+            f"observations and actions are {observations.shape[1]} and {actions.shape[1]} wide, the "
+            f"environment's take {out.shape[1] - 2} columns"
+        )
     offsets = checked_offsets(arrays["episode_offsets"], len(actions))
     lengths = np.diff(offsets)
     if len(observations) != len(actions) + len(lengths) or len(observations) != len(out):

@@ -168,6 +168,14 @@ class Archive:
             raise StoreError(f"{self.place(name)} is damaged{REPAIR}")
         return content
 
+    def content(self) -> bytes:
+        """The whole file.
+
+        Raises:
+            StoreError: it cannot be read.
+        """
+        return self._read_range(0, self.size)
+
     def _read_directory(self) -> dict[str, _Member]:
         """All members by name, from the directory at the end of the file.
 

@@ -1,13 +1,12 @@
 """Parts on disk: the only file that imports zarr or its codecs. Trajectories in, flat arrays out, and back.
 
-A part is a Zarr v3 group. Steps of all episodes lie flat behind one another with `episode_offsets`;
-observations hold one row more per episode, so that row `offset[e] + e + t` is o_t of episode e and
-next observations are never stored twice.
+The arrays of a part are a Zarr v3 group in its archive. Steps of all episodes lie flat behind one another
+with `episode_offsets`; observations hold one row more per episode, so that row `offset[e] + e + t` is o_t of
+episode e and next observations are never stored twice.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise, product
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,16 @@ import numpy.typing as npt
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.plain_files import one_line, read_plain_file
-from tcmrl_data.store.layout import ArrayLayout, check_expansion, chunk_problem, dimension_names, read_layout
+from tcmrl_data.foundation.plain_files import one_line
+from tcmrl_data.store.archive import Archive
+from tcmrl_data.store.layout import (
+    ARRAYS,
+    ArrayLayout,
+    check_expansion,
+    chunk_problem,
+    dimension_names,
+    read_layout,
+)
 
 Arrays = Mapping[str, npt.NDArray[Any]]
 
@@ -81,7 +88,7 @@ def checked_offsets(offsets: npt.NDArray[np.int64], steps: int) -> npt.NDArray[n
 
 
 def encode_arrays(arrays: Arrays) -> dict[str, bytes]:
-    """The files of a part's Zarr group: relative path to content.
+    """The files of a part's Zarr group: name in the archive to content.
 
     Every chunk is there, empty ones too: a missing chunk must never read as zeros.
     """
@@ -105,66 +112,52 @@ def encode_arrays(arrays: Arrays) -> dict[str, bytes]:
             dimension_names=dimension_names(name),
             config={"write_empty_chunks": True},
         )
-    return {name: buffer.to_bytes() for name, buffer in files.items()}
+    return {f"{ARRAYS}/{name}": buffer.to_bytes() for name, buffer in sorted(files.items())}
 
 
-def read_arrays(folder: Path, names: Iterable[str]) -> dict[str, npt.NDArray[Any]]:
-    """Decodes arrays of a part from copies of its checked files in memory.
+def read_arrays(archive: Archive, names: Iterable[str]) -> dict[str, npt.NDArray[Any]]:
+    """Decodes arrays of a part.
 
     Raises:
-        StoreError: a `zarr.json` outside the allow-list, a missing chunk, arrays larger than their files
+        StoreError: a `zarr.json` outside the allow-list, a missing chunk, arrays larger than their chunks
             justify, or bytes that do not decode.
     """
-    layouts = [read_layout(folder, name) for name in names]
-    files = {layout.name: _read_files(folder, layout) for layout in layouts}
-    stored = sum(len(data) for chunks in files.values() for data in chunks.values())
-    check_expansion(layouts, stored, folder)
-    return {layout.name: _decode(folder, layout, files.pop(layout.name)) for layout in layouts}
+    layouts = [read_layout(archive, name) for name in names]
+    chunks = {layout.name: _read_chunks(archive, layout) for layout in layouts}
+    stored = sum(len(data) for files in chunks.values() for data in files)
+    check_expansion(layouts, stored, archive.path)
+    return {layout.name: _decode(archive, layout, chunks.pop(layout.name)) for layout in layouts}
 
 
-def array_files(folder: Path, name: str) -> list[str]:
-    """Relative paths of an array's `zarr.json` and of every chunk its shape calls for.
-
-    Raises:
-        StoreError: the `zarr.json` is missing or outside the allow-list.
-    """
-    return read_layout(folder, name).files()
-
-
-def _read_files(folder: Path, layout: ArrayLayout) -> dict[str, bytes]:
-    """The content of an array's chunk files, checked to be of their declared size."""
+def _read_chunks(archive: Archive, layout: ArrayLayout) -> list[bytes]:
+    """The chunks of an array in order, checked to be of their declared size."""
     limit = 2**16 + layout.chunk_bytes + layout.chunk_bytes // 64
-    contents = {}
+    chunks = []
     for name in layout.files()[1:]:  # the first is zarr.json, which the layout came from
-        try:
-            contents[name] = data = read_plain_file(folder / name, limit=limit)
-        except FileNotFoundError:
-            raise StoreError(f"{folder / name} is missing; run `tcmrl-data repair`") from None
-        except (OSError, ValueError) as error:
-            raise StoreError(f"{folder / name}: {one_line(error)}") from None
+        data = archive.read(name, limit=limit)
         problem = chunk_problem(layout, data)
         if problem:
-            raise StoreError(f"{folder / name} {problem}; run `tcmrl-data repair`")
-    return contents
+            raise StoreError(f"{archive.place(name)} {problem}; run `tcmrl-data repair`")
+        chunks.append(data)
+    return chunks
 
 
-def _decode(folder: Path, layout: ArrayLayout, files: Mapping[str, bytes]) -> npt.NDArray[Any]:
-    """An array from its chunk files: the three codecs of the allow-list undone, without zarr's own overhead.
+def _decode(archive: Archive, layout: ArrayLayout, chunks: Sequence[bytes]) -> npt.NDArray[Any]:
+    """An array from its chunks: the three codecs of the allow-list undone, without zarr's own overhead.
 
     zstd decodes without the interpreter's lock, so that parts can be read side by side.
     """
     array = np.empty(layout.shape, dtype=layout.dtype)
-    for index in product(*map(range, layout.grid)):
-        name = f"{layout.name}/c/{'/'.join(map(str, index))}"
+    for index, name, data in zip(product(*map(range, layout.grid)), layout.files()[1:], chunks, strict=True):
         corner = [i * size for i, size in zip(index, layout.chunks, strict=True)]
         target = array[tuple(slice(at, at + size) for at, size in zip(corner, layout.chunks, strict=True))]
         whole = target.shape == layout.chunks and target.flags.c_contiguous
         chunk = target if whole else np.empty(layout.chunks, dtype=layout.dtype)
         try:
-            _decode_chunk(files[name], chunk)
+            _decode_chunk(data, chunk)
         except (ValueError, RuntimeError) as error:
             raise StoreError(
-                f"{folder / name} does not decode ({one_line(error)}); run `tcmrl-data repair`"
+                f"{archive.place(name)} does not decode ({one_line(error)}); run `tcmrl-data repair`"
             ) from None
         if not whole:
             target[...] = chunk[tuple(map(slice, target.shape))]

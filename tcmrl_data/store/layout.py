@@ -9,22 +9,24 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import product
 from math import prod
-from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from tcmrl_data.foundation.canonical import canonical_json, parse_json
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.plain_files import folder_problem, one_line, read_plain_file
+from tcmrl_data.foundation.plain_files import one_line
+from tcmrl_data.store.archive import Archive
 
 METADATA_BYTES = 2**16
-MAX_CHUNKS = 10**5
-"""Files of one array: 1.6 TB in chunks of 16 MB."""
+MAX_CHUNKS = 10**4
+"""Chunks of one array; in chunks of 16 MB they hold more than an archive may."""
+
+ARRAYS = "arrays"
+"""The Zarr group in a part's archive; the part's other files lie beside it."""
 
 DECODED_FLOOR = 64 * 2**20
 DECODED_RATIO = 256
-GROUP = canonical_json({"zarr_format": 3, "node_type": "group", "attributes": {}})
 ITEM_BYTES = {"float32": 4, "int64": 8, "bool": 1}
 FILL_VALUES = {"float32": "NaN", "int64": 0, "bool": False}
 
@@ -78,73 +80,56 @@ class ArrayLayout:
         return self.chunk_bytes * prod(self.grid)
 
     def files(self) -> list[str]:
-        """Relative paths of `zarr.json` and of every chunk that the shape calls for."""
+        """Names in the archive of `zarr.json` and of every chunk that the shape calls for."""
         chunk_files = ("/".join(map(str, ("c", *index))) for index in product(*map(range, self.grid)))
-        return [f"{self.name}/{file}" for file in ("zarr.json", *chunk_files)]
+        return [f"{ARRAYS}/{self.name}/{file}" for file in ("zarr.json", *chunk_files)]
 
 
-def check_layout(folder: Path, arrays: Mapping[str, Mapping[str, Any]]) -> list[ArrayLayout]:
+def check_layout(archive: Archive, arrays: Mapping[str, Mapping[str, Any]]) -> list[ArrayLayout]:
     """Checks a part's `zarr.json` files against the allow-list and the part's own record.
 
     Args:
-        folder: the part.
+        archive: the part.
         arrays: name to `{"dtype", "shape", …}`, as the part's record has them.
 
     Raises:
         StoreError: names the file and the field.
     """
-    read_group(folder / "zarr.json")
-    return [check_array(folder, name, record) for name, record in arrays.items()]
+    _read_metadata(_GroupMetadata, archive, f"{ARRAYS}/zarr.json")
+    layouts = []
+    for name, record in arrays.items():
+        layout = read_layout(archive, name)
+        if layout.dtype != record["dtype"] or layout.shape != tuple(record["shape"]):
+            raise StoreError(
+                f"{archive.place(layout.files()[0])}: data_type {layout.dtype}, shape {list(layout.shape)} "
+                f"are not what part.json records, {record['dtype']}, {list(record['shape'])}"
+            )
+        layouts.append(layout)
+    return layouts
 
 
-def check_array(folder: Path, name: str, record: Mapping[str, Any]) -> ArrayLayout:
-    """The layout of an array that is what the part's record says it is.
-
-    Raises:
-        StoreError: names the file and the field.
-    """
-    layout = read_layout(folder, name)
-    if layout.dtype != record["dtype"] or layout.shape != tuple(record["shape"]):
-        raise StoreError(
-            f"{folder / name / 'zarr.json'}: data_type {layout.dtype}, shape {list(layout.shape)} are not "
-            f"what part.json records, {record['dtype']}, {list(record['shape'])}"
-        )
-    return layout
-
-
-def read_group(file: Path) -> None:
-    """Checks the `zarr.json` of a group.
-
-    Raises:
-        StoreError: it is missing or outside the allow-list.
-    """
-    _read_metadata(_GroupMetadata, file)
-
-
-def read_layout(folder: Path, name: str) -> ArrayLayout:
+def read_layout(archive: Archive, name: str) -> ArrayLayout:
     """The layout of an array.
 
     Raises:
         StoreError: its `zarr.json` is missing or outside the allow-list.
     """
-    blocked = folder_problem(folder, name)
-    if blocked:
-        raise StoreError(f"{folder / name / 'zarr.json'} is missing: {blocked[0]} {blocked[1]}")
-    metadata = _read_metadata(_ArrayMetadata, folder / name / "zarr.json")
+    file = f"{ARRAYS}/{name}/zarr.json"
+    metadata = _read_metadata(_ArrayMetadata, archive, file)
     if metadata.dimension_names != dimension_names(name):
         raise StoreError(
-            f"{folder / name / 'zarr.json'}: dimension_names {str(metadata.dimension_names)[:200]} are not "
+            f"{archive.place(file)}: dimension_names {str(metadata.dimension_names)[:200]} are not "
             f"{dimension_names(name)}, those of {name}"
         )
     layout = ArrayLayout(name, metadata.data_type, metadata.shape, metadata.chunks)
     if prod(layout.grid) > MAX_CHUNKS:
         raise StoreError(
-            f"{folder / name / 'zarr.json'}: shape {list(layout.shape)} calls for over {MAX_CHUNKS} chunks"
+            f"{archive.place(file)}: shape {list(layout.shape)} calls for over {MAX_CHUNKS} chunks"
         )
     return layout
 
 
-def check_expansion(layouts: Iterable[ArrayLayout], stored_bytes: int, place: Path) -> None:
+def check_expansion(layouts: Iterable[ArrayLayout], stored_bytes: int, place: object) -> None:
     """Refuses arrays that would decode to more than their size on disk justifies.
 
     Raises:
@@ -245,18 +230,17 @@ class _ArrayMetadata(_Metadata):
 Metadata = TypeVar("Metadata", bound=_Metadata)
 
 
-def _read_metadata(kind: type[Metadata], file: Path) -> Metadata:
+def _read_metadata(kind: type[Metadata], archive: Archive, name: str) -> Metadata:
+    data = archive.read(name, limit=METADATA_BYTES)
     try:
-        metadata: Metadata = _parse_metadata(kind, read_plain_file(file, limit=METADATA_BYTES))
+        metadata: Metadata = _parse_metadata(kind, data)
         return metadata
     except ValidationError as error:
         detail = error.errors()[0]
         field = ".".join(map(str, detail["loc"])) or "values"
-        raise StoreError(f"{file}: {field}: {detail['msg']}") from None
-    except FileNotFoundError:
-        raise StoreError(f"{file} is missing; run `tcmrl-data repair`") from None
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{file}: not readable as zarr.json ({one_line(error)})") from None
+        raise StoreError(f"{archive.place(name)}: {field}: {detail['msg']}") from None
+    except ValueError as error:
+        raise StoreError(f"{archive.place(name)}: not readable as zarr.json ({one_line(error)})") from None
 
 
 @functools.lru_cache(maxsize=512)  # parts of equally long episodes have the same files, byte for byte

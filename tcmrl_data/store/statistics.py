@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tcmrl_data.envs.trajectory import Trajectory
-from tcmrl_data.store.manifest import Statistics
+from tcmrl_data.store.part_record import Statistics
 
 QUANTILES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
 

@@ -1,10 +1,8 @@
 """Checks of a part's content: digests, episodes, values, flags, statistics and policy."""
 
 import math
-import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,11 +11,16 @@ from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import GaussianDescription, read_snapshot
 from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import draw_tasks
+from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.foundation.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
+from tcmrl_data.foundation.plain_files import words_after
 from tcmrl_data.foundation.validation import first_problem
+from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import array_digests, read_arrays, unpack
-from tcmrl_data.store.manifest import MAX_TASKS, STANDARD_ARRAYS, Manifest, PartRecord
+from tcmrl_data.store.limits import MAX_TASKS
+from tcmrl_data.store.part_files import POLICY
+from tcmrl_data.store.part_record import RECORD, STANDARD_ARRAYS, PartRecord
 from tcmrl_data.store.statistics import statistics
 
 ContentProblem = tuple[str, str]
@@ -27,21 +30,22 @@ CLOSE = 1e-9
 """Relative tolerance of recomputed sums; the order of summation may depend on the machine."""
 
 
-def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None) -> Iterator[ContentProblem]:
+def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None) -> Iterator[ContentProblem]:
     """Yields the problems of a part's content.
 
     Args:
-        folder: the part; its layout has been checked.
+        archive: the part; its members have been checked.
         record: its record.
-        manifest: what the dataset was built from; None where it cannot be read.
+        recipe: what it was built from; None where that is not known.
     """
-    yield from _policy_problems(folder, record, manifest)
+    environment = None if recipe is None else _environment(recipe)
+    yield from _policy_problems(archive, record, environment)
     arrays: dict[str, npt.NDArray[Any]] = {}
     for name, recorded in record.identity.arrays.items():
         try:
-            arrays |= read_arrays(folder, [name])
+            arrays |= read_arrays(archive, [name])
         except StoreError as error:
-            yield _place(error, folder, default=name)
+            yield name, words_after(error, archive.path)
             continue
         if array_digests({name: arrays[name]})[name] != recorded.model_dump(mode="json"):
             yield name, "decoded values do not have the recorded sha256"
@@ -49,8 +53,8 @@ def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None
         return
     problems = list(_value_problems(arrays))
     yield from problems
-    if manifest is not None:
-        yield from _shape_problems(arrays, manifest)
+    if recipe is not None and environment is not None:
+        yield from _shape_problems(arrays, recipe, environment)
     try:
         episodes = unpack(arrays)
     except (StoreError, TrajectoryError) as error:
@@ -62,12 +66,12 @@ def content_problems(folder: Path, record: PartRecord, manifest: Manifest | None
     found = statistics(episodes).model_dump()
     for field, recorded_value in record.statistics.model_dump().items():
         if not is_close(found[field], recorded_value):
-            yield "part.json", f"statistics.{field} is not what the arrays give"
+            yield RECORD, f"statistics.{field} is not what the arrays give"
 
 
-def task_problems(manifest: Manifest) -> Iterator[str]:
-    """Yields the differences of the manifest's tasks from those that the recipe draws."""
-    environment = _environment(manifest)
+def task_problems(tasks: Sequence[Task], recipe: Recipe) -> Iterator[str]:
+    """Yields the differences of a dataset's tasks from those that its recipe draws."""
+    environment = _environment(recipe)
     if isinstance(environment, str):
         yield environment
         return
@@ -75,13 +79,13 @@ def task_problems(manifest: Manifest) -> Iterator[str]:
         yield f"recipe.environment.tasks is {environment.settings.tasks}, more than {MAX_TASKS}"
         return
     drawn = {task.index: task for task in draw_tasks(environment)}
-    for task in manifest.tasks:
+    for task in tasks:
         if task.index not in drawn:
-            yield f"tasks: task {task.index} is not in the recipe's task set"
+            yield f"task {task.index} is not in the recipe's task set"
         elif task.split != drawn[task.index].split:
-            yield f"tasks: split of task {task.index} is not the one that the recipe draws"
+            yield f"split of task {task.index} is not the one that the recipe draws"
         elif not is_close(task.parameters, dict(drawn[task.index].parameters)):
-            yield f"tasks: parameters of task {task.index} are not those that the recipe draws"
+            yield f"parameters of task {task.index} are not those that the recipe draws"
 
 
 def is_close(left: Any, right: Any) -> bool:
@@ -95,33 +99,28 @@ def is_close(left: Any, right: Any) -> bool:
     return bool(left == right)
 
 
-def _place(error: Exception, folder: Path, *, default: str) -> ContentProblem:
-    """The file within a part that an error names first, and the rest of the message."""
-    match = re.fullmatch(r"([a-z0-9_./]+?):? (.*)", str(error).removeprefix(f"{folder}/"))
-    return (match[1], match[2]) if match else (default, str(error))
-
-
-def _environment(manifest: Manifest) -> Environment | str:
-    """The manifest's environment, or the reason why it cannot be made."""
+def _environment(recipe: Recipe) -> Environment | str:
+    """The recipe's environment, or the reason why it cannot be made."""
     try:
-        return manifest.recipe.make_environment()
+        return recipe.make_environment()
     except ValidationError as error:
         return f"recipe.environment: {first_problem(error)}"
     except TcmrlError as error:
         return f"recipe.environment: {error}"
 
 
-def _policy_problems(folder: Path, record: PartRecord, manifest: Manifest | None) -> Iterator[ContentProblem]:
+def _policy_problems(
+    archive: Archive, record: PartRecord, environment: Environment | str | None
+) -> Iterator[ContentProblem]:
     try:
-        snapshot = read_snapshot(folder, record.identity.step)
+        snapshot = read_snapshot(archive.read, record.identity.step, place=str(archive.path))
     except SnapshotError as error:
-        yield _place(error, folder, default="policy.json")
+        yield "policy", words_after(error, archive.path)
         return
     if snapshot.digest() != record.identity.policy:
         yield "policy.json", "the policy does not have the recorded digest"
-    if ("policy.safetensors" in record.files) != bool(snapshot.tensors):
-        yield "part.json", "files and policy.json disagree on policy.safetensors"
-    environment = None if manifest is None else _environment(manifest)
+    if (POLICY[1] in archive.names) != bool(snapshot.tensors):
+        yield "policy.json", "does not agree with policy.safetensors"
     if isinstance(snapshot.description, GaussianDescription) and isinstance(environment, Environment):
         sizes = (snapshot.description.observation_dim, snapshot.description.action_dim)
         if sizes != (environment.observation_dim, environment.action_dim):
@@ -138,13 +137,14 @@ def _value_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[ContentP
         yield "actions", f"reach {largest:g}, outside [-1, 1]"
 
 
-def _shape_problems(arrays: Mapping[str, npt.NDArray[Any]], manifest: Manifest) -> Iterator[ContentProblem]:
+def _shape_problems(
+    arrays: Mapping[str, npt.NDArray[Any]], recipe: Recipe, environment: Environment | str
+) -> Iterator[ContentProblem]:
     episodes = len(arrays["episode_offsets"]) - 1
-    if episodes != manifest.recipe.rollouts.episodes:
-        yield "episode_offsets", f"{episodes} episodes, not the recipe's {manifest.recipe.rollouts.episodes}"
-    environment = _environment(manifest)
+    if episodes != recipe.rollouts.episodes:
+        yield "episode_offsets", f"{episodes} episodes, not the recipe's {recipe.rollouts.episodes}"
     if isinstance(environment, str):
-        yield "part.json", environment
+        yield RECORD, environment
         return
     for name, width in (("observations", environment.observation_dim), ("actions", environment.action_dim)):
         if arrays[name].shape[1] != width:
@@ -152,7 +152,7 @@ def _shape_problems(arrays: Mapping[str, npt.NDArray[Any]], manifest: Manifest) 
     extras = {name: str(array.dtype) for name, array in arrays.items() if name not in STANDARD_ARRAYS}
     wanted = {name: str(np.dtype(dtype)) for name, dtype in environment.extras.items()}
     if extras != wanted:
-        yield "part.json", f"extra arrays {extras} are not the environment's {wanted}"
+        yield RECORD, f"extra arrays {extras} are not the environment's {wanted}"
     longest = int(np.diff(arrays["episode_offsets"]).max(initial=0))
     if longest > environment.settings.horizon:
         yield "episode_offsets", f"an episode of {longest} steps, horizon {environment.settings.horizon}"

@@ -1,10 +1,10 @@
 """Removal of files that builds no longer need: abandoned staging and checkpoints of finished units."""
 
-from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_data.build.work_files import check_work_files, checkpoint_tasks
+from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import (
     CHECKPOINTS,
     LOCK,
@@ -94,9 +94,12 @@ def _done_tasks(folder: Path) -> dict[int, bool]:
     """Whether every part of a task is in the manifest, by index; empty where there is no manifest yet."""
     if not (folder / MANIFEST).exists():
         return {}
-    manifest = read_manifest(folder)
-    counts = Counter(entry.task for entry in manifest.parts)
-    return {task.index: counts[task.index] == len(manifest.steps) for task in manifest.tasks}
+    dataset = Dataset(folder, read_manifest(folder))
+    dropped = set(dataset.manifest.dropped)
+    return {
+        task.index: task.index in dropped or not dataset.missing(task.index)
+        for task in dataset.recorded_tasks
+    }
 
 
 def _size(path: Path) -> int:

@@ -1,38 +1,34 @@
 """Repair: rebuilds rejected parts in the staging folder, checks their ids, and replaces the old ones."""
 
-import shutil
 import stat
 import uuid
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.build import BuildReport, build_dataset
+from tcmrl_data.build.build import build_dataset
 from tcmrl_data.build.events import BuildEvent
+from tcmrl_data.build.published import Published, read_published
 from tcmrl_data.build.work_files import check_work_files
+from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
     lock_file,
-    make_folders,
     move_into_place,
     remove_abandoned,
     remove_tree,
     replace_file,
 )
 from tcmrl_data.foundation.errors import NondeterminismError, ReadOnlyError
-from tcmrl_data.foundation.plain_files import folder_problem
-from tcmrl_data.store.layout import GROUP
-from tcmrl_data.store.manifest import (
-    MANIFEST,
-    Manifest,
-    dataset_folder,
-    part_folder,
-    read_manifest,
-    read_sealed_part,
-    seal,
-)
-from tcmrl_data.verification.verify import Finding, Key, VerifyLevel, verify_dataset
+from tcmrl_data.foundation.plain_files import folder_problem, read_plain_file
+from tcmrl_data.store.archive import LARGEST_ARCHIVE
+from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.store.manifest import Run, dataset_folder, read_manifest
+from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
+from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.verification.tables import numbered, restore_tables, write_tables
+from tcmrl_data.verification.verify import Finding, VerifyLevel, find_problems, verify_dataset
 
 REPAIR = "repair"
 """Folder in `.staging` for rebuilt parts."""
@@ -43,16 +39,16 @@ class RepairReport:
     """What a repair did.
 
     Attributes:
-        repaired: (task, step) of the parts that were made again, with the ids that they had.
-        groups: group records above the parts that were written again.
+        repaired: keys of the parts that were made again, with the ids that they had.
+        tables: tables that were written again from the parts.
         left: findings that a repair leaves to people: foreign files, and values of the manifest.
         failed: one line per task that could not be made again; the dataset is then as it was.
         read_only: the folder cannot be written, and nothing had to be.
     """
 
     dataset: Path
-    repaired: tuple[Key, ...]
-    groups: tuple[str, ...]
+    repaired: tuple[PartKey, ...]
+    tables: tuple[str, ...]
     left: tuple[Finding, ...]
     failed: tuple[str, ...]
     read_only: bool
@@ -67,9 +63,9 @@ def repair_dataset(
 ) -> RepairReport:
     """Rebuilds the parts that verification rejects, and only these, with the manifest's recipe and seed.
 
-    New parts replace old ones only when all are made and have the ids of the manifest; until then the
-    dataset is not touched. What lies in the folder of a replaced part goes with it; every other foreign
-    file stays and is named.
+    New parts replace old ones only when all are made and have the ids of the table; until then the dataset is
+    not touched. Damaged tables are written again from the parts, if these have the manifest's root. Foreign
+    files stay and are named.
 
     Args:
         path: the dataset's folder or its `manifest.json`.
@@ -78,17 +74,18 @@ def repair_dataset(
         progress: called with the events of the build.
 
     Raises:
-        ManifestError: the manifest itself is damaged. Delete the part folders that `verify` names and
-            the manifest, then build with the options of the first build, which keeps the sound parts.
+        ManifestError: the manifest itself is damaged. Delete it and the parts that `verify` names, then build
+            with the options of the first build, which keeps the sound parts.
+        BuildError: the tables are damaged and the parts do not have the manifest's root.
         LockedError: another process works on the dataset.
         ReadOnlyError: the folder cannot be written, and something is damaged.
         NondeterminismError: a part came out with another id; nothing was replaced.
     """
     folder = dataset_folder(path)
-    manifest = read_manifest(folder)
-    check_work_files(folder)
+    read_manifest(folder)
+    check_work_files(folder, but=(TASKS, PARTS_TABLE))
     try:
-        return _repair(folder, manifest, level=level, workers=workers, progress=progress)
+        return _repair(folder, level=level, workers=workers, progress=progress)
     except ReadOnlyError:
         findings = verify_dataset(folder, level=level).findings
         if any(not finding.foreign for finding in findings):
@@ -98,7 +95,6 @@ def repair_dataset(
 
 def _repair(
     folder: Path,
-    manifest: Manifest,
     *,
     level: VerifyLevel,
     workers: int | None,
@@ -106,102 +102,114 @@ def _repair(
 ) -> RepairReport:
     with lock_file(folder / LOCK, f"dataset {folder}"):
         remove_abandoned(folder)
-        findings = verify_dataset(folder, level=level).findings
-        rejected = {
-            (finding.task, finding.step): finding
-            for finding in findings
-            if finding.task is not None and finding.step is not None and not finding.foreign
-        }
-        keys = tuple(sorted((task, step) for task, step in rejected if task is not None and step is not None))
+        findings = find_problems(folder, level)
+        damaged = sorted({finding.file for finding in findings if not finding.foreign} & {TASKS, PARTS_TABLE})
+        if damaged:
+            restore_tables(folder, read_manifest(folder))
+            findings = find_problems(folder, level)
+        keys = tuple(sorted({finding.key for finding in findings if finding.key is not None}))
         failed: tuple[str, ...] = ()
         if keys:
-            failed = _make_again(folder, manifest, keys, workers, progress).failed
-        if failed:
-            return RepairReport(folder, (), (), findings, failed, read_only=False)
-        groups = _restore(folder, manifest, keys, findings)
+            failed = _replace_parts(folder, keys, workers, progress)
         remove_tree(folder / STAGING / REPAIR)
-    left = verify_dataset(folder, level=level).findings
-    return RepairReport(folder, keys, groups, left, (), read_only=False)
+        left = find_problems(folder, level)
+    return RepairReport(folder, () if failed else keys, tuple(damaged), left, failed, read_only=False)
+
+
+def _replace_parts(
+    folder: Path, keys: Sequence[PartKey], workers: int | None, progress: Callable[[BuildEvent], None]
+) -> tuple[str, ...]:
+    """Makes parts again and puts them in their places; returns one line per failure, if nothing was replaced.
+
+    Raises:
+        NondeterminismError: a part came out with another id; nothing was replaced.
+    """
+    dataset = Dataset(folder, read_manifest(folder))
+    made: dict[PartKey, Path] = {}
+    for run in dataset.manifest.runs:
+        chosen = [key for key in keys if key.run == run.name]
+        if chosen and (run.recipe is None or run.kind != "built"):
+            return (f"{len(chosen)} parts of run {run.name} were not built here; restore them from a copy",)
+        if chosen:
+            target = folder / STAGING / REPAIR / run.name
+            failed = _make_again(dataset, run, chosen, target, workers, progress)
+            if failed:
+                return failed
+            made |= {key: target / part_file(PartKey(key.task, key.step)) for key in chosen}
+    published = [read_published(file, key.run)[0] for key, file in made.items()]
+    for part in published:
+        recorded = dataset.recorded_parts.entry(part.entry.key)
+        assert recorded is not None
+        if part.entry.id != recorded.id:
+            raise NondeterminismError(
+                f"{folder}: the part of {part.entry.key} came out as {part.entry.id}, the table has "
+                f"{recorded.id}; repair on the platform that `tcmrl-data show` names"
+            )
+    for key, file in made.items():
+        _clear(folder, part_file(key))
+        replace_file(folder / part_file(key), file.read_bytes(), staging=folder / STAGING)
+    _record(dataset, published)
+    return ()
 
 
 def _make_again(
-    folder: Path,
-    manifest: Manifest,
-    keys: tuple[Key, ...],
+    dataset: Dataset,
+    run: Run,
+    keys: Sequence[PartKey],
+    target: Path,
     workers: int | None,
     progress: Callable[[BuildEvent], None],
-) -> BuildReport:
-    """Builds the affected tasks in `.staging/repair`, sound parts copied there, and compares ids."""
-    target = folder / STAGING / REPAIR
-    make_folders(target)
-    tasks = sorted({task for task, _ in keys})
-    for entry in manifest.parts:
-        place = part_folder(entry.task, entry.step)
-        if entry.task in tasks and (entry.task, entry.step) not in keys:
-            make_folders((target / place).parent)
-            shutil.copytree(folder / place, target / place)
-    report = build_dataset(
-        manifest.recipe, target, seed=manifest.seed, tasks=tasks, workers=workers, progress=progress
-    )
-    if report.failed:
-        return report
-    ids = {(entry.task, entry.step): entry.id for entry in manifest.parts}
-    for task, step in keys:
-        found = read_sealed_part(target / part_folder(task, step) / "part.json")[0].id
-        if found != ids[task, step]:
-            remove_tree(target)
-            raise NondeterminismError(
-                f"{folder}: task {task} at step {step} came out as {found}, the manifest has "
-                f"{ids[task, step]}; repair on the CPU model and package versions that its part.json names"
-            )
-    return report
-
-
-def _restore(
-    folder: Path, manifest: Manifest, keys: tuple[Key, ...], findings: tuple[Finding, ...]
 ) -> tuple[str, ...]:
-    """Puts the new parts and the group records in place, and their new digests into the manifest."""
-    sealed: dict[Key, str] = {}
-    for key in keys:
-        place = part_folder(*key)
-        new = folder / STAGING / REPAIR / place
-        sealed[key] = read_sealed_part(new / "part.json")[1]
-        _clear(folder, place)
-        make_folders((folder / place).parent)
-        move_into_place(new, folder / place)
-    groups = _group_files(keys) | {
-        finding.file
-        for finding in findings
-        if not finding.foreign and finding.task is None and finding.file != MANIFEST
-    }
-    restored = []
-    for file in sorted(groups):
-        target = folder / file
-        if target.name == "zarr.json" and not target.is_dir() and not _holds(target):
-            replace_file(target, GROUP, staging=folder / STAGING)
-            restored.append(file)
-    if sealed:
-        fields = manifest.model_dump(mode="json", exclude={"digest"})
-        for entry in fields["parts"]:
-            entry["sha256"] = sealed.get((entry["task"], entry["step"]), entry["sha256"])
-        replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
-    return tuple(restored)
+    """Builds the affected tasks of a run in a folder, where their sound parts lie; their groups train along.
+
+    Returns:
+        One line per failure.
+    """
+    assert run.recipe is not None
+    assert run.seed is not None
+    tasks = {key.task for key in keys}
+    group_size = run.recipe.make_source().group_size
+    groups = {task // group_size for task in tasks}
+    recorded = dataset.recorded_tasks
+    others = [
+        task.index for task in recorded if task.index // group_size in groups and task.index not in tasks
+    ]
+    for task in sorted(tasks):
+        for key in dataset.recorded_parts.keys_of(task):
+            if key.run == run.name and key not in keys:
+                copy = target / part_file(PartKey(key.task, key.step))
+                data = read_plain_file(dataset.file_of(key), limit=LARGEST_ARCHIVE)
+                replace_file(copy, data, staging=target / STAGING)
+    report = build_dataset(
+        run.recipe,
+        target,
+        seed=run.seed,
+        tasks=sorted(tasks),
+        dropped=others,
+        workers=workers,
+        progress=progress,
+    )
+    return report.failed
 
 
-def _group_files(keys: tuple[Key, ...]) -> set[str]:
-    """Group records above parts."""
-    parents = {parent for key in keys for parent in Path(part_folder(*key)).parents}
-    return {str(parent / "zarr.json") for parent in parents}
+def _record(dataset: Dataset, parts: Sequence[Published]) -> None:
+    """Writes new lines for parts that have other bytes than before, as made on another platform."""
+    platforms = list(dataset.manifest.platforms)
+    before = {entry.key: entry for entry in dataset.recorded_parts.entries()}
+    now = {entry.key: entry for entry in numbered(parts, platforms)}
+    if all(before[key] == entry for key, entry in now.items()):
+        return
+    lines = before | now
+    table = PartTable.empty().with_entries(list(lines.values()))
+    write_tables(
+        dataset.folder, dataset.manifest, tasks=dataset.recorded_tasks, table=table, platforms=platforms
+    )
 
 
-def _holds(file: Path) -> bool:
-    return not file.is_symlink() and file.is_file() and file.read_bytes() == GROUP
-
-
-def _clear(folder: Path, place: str) -> None:
-    """Removes what is at a part's path, or a link or file on the way to it; never follows a link."""
-    blocked = folder_problem(folder, place)
-    old = folder / (blocked[0] if blocked else place)
+def _clear(folder: Path, file: str) -> None:
+    """Removes what is in the way of a part's file: a link, a folder, or something else; follows no link."""
+    blocked = folder_problem(folder, file.rpartition("/")[0])
+    old = folder / (blocked[0] if blocked else file)
     try:
         is_folder = stat.S_ISDIR(old.lstat().st_mode)
     except FileNotFoundError:

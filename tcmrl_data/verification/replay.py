@@ -3,7 +3,6 @@
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,12 +12,14 @@ from pydantic import ValidationError
 from tcmrl_data.behavior.snapshot import read_snapshot
 from tcmrl_data.build.part import roll_out_part
 from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.provenance import provenance
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import TcmrlError
+from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import pack, read_arrays
+from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.layout import DECODED_FLOOR, DECODED_RATIO
-from tcmrl_data.store.manifest import Manifest, PartRecord
+from tcmrl_data.store.part_record import PartRecord
 
 FIRST_STEPS = 5
 STEP_TOLERANCE = 1e-3
@@ -33,64 +34,66 @@ class Replay:
     """One part made again.
 
     Attributes:
-        exact: made on the CPU model, with the packages and the physics of the original, so that every bit
-            was compared; otherwise within the tolerances of this module.
+        platform_differences: how this platform differs from the part's. On an equal platform every bit is
+            compared, otherwise the values are within the tolerances of this module.
         problems: differences from the stored arrays.
     """
 
     task: int
     step: int
-    exact: bool
+    run: str
+    platform_differences: tuple[str, ...]
     problems: tuple[str, ...]
 
+    @property
+    def exact(self) -> bool:
+        """Whether every bit was compared."""
+        return not self.platform_differences
 
-def spread_parts(keys: Sequence[tuple[int, int]], number: int) -> list[tuple[int, int]]:
+
+def spread_parts(keys: Sequence[PartKey], number: int) -> list[PartKey]:
     """At most `number` parts, evenly spread over all, the first and the last among them."""
     positions = np.linspace(0, len(keys) - 1, min(number, len(keys))).round().astype(int)
     return [keys[position] for position in positions]
 
 
-def replay_part(folder: Path, record: PartRecord, manifest: Manifest) -> Replay:
+def replay_part(archive: Archive, record: PartRecord, key: PartKey, recipe: Recipe) -> Replay:
     """Rolls a part out again, whole lane batches, and compares.
 
     Args:
-        folder: the part.
+        archive: the part.
         record: its record.
-        manifest: what it was built from.
+        key: the part's.
+        recipe: what it was built from.
     """
     identity = record.identity
-    exact = False
+    differences: tuple[str, ...] = ()
     try:
-        _check_cost(record, manifest)
-        plan = BuildPlan.of_tasks(manifest.recipe, seed=manifest.seed, tasks=_tasks(manifest))
-        here = provenance(plan.environment, {})
-        exact = all(record.provenance.get(key) == here[key] for key in ("cpu", "packages", "physics"))
-        made = _make_again(folder, record, plan)
-        stored = read_arrays(folder, identity.arrays)
-        compare = _bit_problems if exact else _drift_problems
+        _check_cost(archive, record, recipe)
+        task = Task(identity.task, "train", identity.parameters)  # the split has no part in rollouts
+        plan = BuildPlan.of_tasks(recipe, seed=identity.seed, tasks=[task])
+        differences = tuple(plan.platform.differences(record.platform))
+        made = _make_again(archive, identity.step, plan)
+        stored = read_arrays(archive, identity.arrays)
+        compare = _drift_problems if differences else _bit_problems
         problems = tuple(compare(stored, made))
     except (TcmrlError, ValidationError, KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
         problems = (f"cannot be made again ({' '.join(str(error).split())[:200]})",)
-    return Replay(identity.task, identity.step, exact, problems)
+    return Replay(key.task, key.step, key.run, differences, problems)
 
 
-def _check_cost(record: PartRecord, manifest: Manifest) -> None:
+def _check_cost(archive: Archive, record: PartRecord, recipe: Recipe) -> None:
     """Refuses lane batches whose buffers the part's size does not justify."""
-    horizon, lanes = manifest.recipe.environment.horizon, manifest.recipe.rollouts.lanes
+    horizon, lanes = recipe.environment.horizon, recipe.rollouts.lanes
     shapes = record.identity.arrays
     columns = shapes["observations"].shape[1] + shapes["actions"].shape[1] + 2
-    stored = sum(file.size for file in record.files.values())
-    if lanes * (horizon + 1) * columns * 4 > max(DECODED_FLOOR, DECODED_RATIO * stored):
+    if lanes * (horizon + 1) * columns * 4 > max(DECODED_FLOOR, DECODED_RATIO * archive.size):
         raise ValueError(f"{lanes} lanes of {horizon} steps are more than the part's size justifies")
 
 
-def _tasks(manifest: Manifest) -> list[Task]:
-    return [Task(task.index, task.split, task.parameters) for task in manifest.tasks]
-
-
-def _make_again(folder: Path, record: PartRecord, plan: BuildPlan) -> dict[str, npt.NDArray[Any]]:
-    task = next(task for task in plan.tasks if task.index == record.identity.task)
-    snapshot = read_snapshot(folder, record.identity.step)
+def _make_again(archive: Archive, step: int, plan: BuildPlan) -> dict[str, npt.NDArray[Any]]:
+    (task,) = plan.tasks
+    snapshot = read_snapshot(archive.read, step, place=str(archive.path))
     parameters = [task.parameters] * plan.recipe.rollouts.lanes
     with _one_thread(), contextlib.closing(plan.environment.lanes(parameters)) as lanes:
         return pack(roll_out_part(plan, task=task, snapshot=snapshot, lanes=lanes))

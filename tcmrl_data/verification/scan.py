@@ -10,7 +10,7 @@ from tcmrl_data.build.work_files import WORK_FILES, WORK_FOLDERS
 from tcmrl_data.foundation.plain_files import one_line
 
 MAX_DEPTH = 10
-"""A part's chunks lie 8 folders deep."""
+"""Parts lie 3 folders deep."""
 
 
 @dataclass(frozen=True)

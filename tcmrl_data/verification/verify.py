@@ -1,45 +1,36 @@
-"""Verification of a dataset, file by file; damage is reported as findings and not raised.
+"""Verification of a dataset; damage is reported as findings and not raised.
 
-`quick` checks names, sizes, links and the allow-list; `digests` also hashes every file; `deep` also decodes
-every array and checks its content (`contents.py`); `replay.py` rolls parts out again.
+`quick` checks names, sizes and kinds of files; `digests` also hashes every archive and checks its directory
+and its record; `deep` also decodes every array and checks its content (`contents.py`); `replay.py` rolls
+parts out again. Beside a running build, a verification checks what the manifest named when it began.
 """
 
-import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import sha256
-from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.plain_files import (
-    file_problem,
-    folder_problem,
-    one_line,
-    read_plain_file,
-    words_after,
-)
-from tcmrl_data.store.layout import GROUP
-from tcmrl_data.store.manifest import (
-    MANIFEST,
-    Manifest,
-    PartEntry,
-    PartRecord,
-    TaskRecord,
-    dataset_folder,
-    part_folder,
-    read_manifest,
-    read_sealed_part,
-)
-from tcmrl_data.store.part_files import identity_problems, layout_problems
+from tcmrl_data.foundation.disk import LOCK, lock_holder
+from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.foundation.machine import available_cores
+from tcmrl_data.foundation.plain_files import file_problem, folder_problem, words_after
+from tcmrl_data.store.archive import Archive
+from tcmrl_data.store.keys import PARTS, PartKey, key_of_file, part_file
+from tcmrl_data.store.manifest import MANIFEST, Manifest, Run, TableSeal, dataset_folder, read_manifest
+from tcmrl_data.store.part_files import check_members, identity_problems
+from tcmrl_data.store.part_record import PartRecord, read_part_record
+from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, PartTable, parse_parts
+from tcmrl_data.store.tables import read_sealed
+from tcmrl_data.store.task_table import TASKS, parse_tasks
 from tcmrl_data.verification.contents import content_problems, task_problems
 from tcmrl_data.verification.replay import Replay, replay_part, spread_parts
 from tcmrl_data.verification.scan import Scan, scan_dataset
 
 VerifyLevel = Literal["quick", "digests", "deep"]
-Key = tuple[int, int]
-PART = re.compile(r"tasks/([0-9]{5,10})/snapshots/step_([0-9]{7,10})(?:/|$)")
 
 
 @dataclass(frozen=True)
@@ -51,14 +42,21 @@ class Finding:
         problem: what is wrong with it.
         task: task of the part that it belongs to.
         step: snapshot step of that part.
-        foreign: it belongs to no part that the manifest names; repair leaves it alone.
+        run: run of that part.
+        foreign: it belongs to nothing that the manifest names; repair leaves it alone.
     """
 
     file: str
     problem: str
     task: int | None = None
     step: int | None = None
+    run: str | None = None
     foreign: bool = False
+
+    @property
+    def key(self) -> PartKey | None:
+        """The part that a finding is about; None for other files, and for foreign ones."""
+        return None if self.foreign else key_of_file(self.file)
 
 
 @dataclass(frozen=True)
@@ -106,9 +104,9 @@ def verify_dataset(
     """
     started = time.monotonic()
     folder = dataset_folder(path)
-    if not folder.is_dir() or not any((folder / name).exists() for name in (MANIFEST, "tasks")):
+    if not folder.is_dir() or not any((folder / name).exists() for name in (MANIFEST, PARTS)):
         raise ManifestError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
-    run = _Verification(folder, level, scan_dataset(folder))
+    run = _Verification(folder, level, is_written=lock_holder(folder / LOCK) is not None)
     parts = run.check(progress)
     replays = run.replay(replay)
     sizes = [status.st_size for status in run.scan.files.values()]
@@ -124,183 +122,212 @@ def verify_dataset(
     )
 
 
+def find_problems(folder: Path, level: VerifyLevel) -> tuple[Finding, ...]:
+    """What `verify_dataset` finds; for a caller that holds the dataset's lock."""
+    run = _Verification(folder, level, is_written=False)
+    run.check(lambda done, total: None)
+    return tuple(sorted(set(run.findings), key=lambda finding: (finding.file, finding.problem)))
+
+
 @dataclass
 class _Verification:
     """One run over a dataset.
 
     Attributes:
-        expected: files that belong to the dataset.
-        opaque: folders of parts whose record cannot be trusted, so that their files are unknown.
+        is_written: another process writes to the dataset.
+        manifest: None where it cannot be read; tables that cannot be read are empty.
     """
 
     folder: Path
     level: VerifyLevel
-    scan: Scan
+    is_written: bool
     findings: list[Finding] = field(default_factory=list)
-    expected: set[str] = field(default_factory=lambda: {MANIFEST})
-    opaque: set[str] = field(default_factory=set)
-    manifest: Manifest | None = None
-    entries: dict[Key, PartEntry] = field(default_factory=dict)
-    tasks: dict[int, TaskRecord] = field(default_factory=dict)
-    records: dict[Key, PartRecord] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self.manifest = self._read_manifest()
+        self.tasks, self.table = self._read_tables()
+        self.scan: Scan = scan_dataset(self.folder)
+        self._tasks_by_index = {task.index: task for task in self.tasks}
+        self._runs = {run.name: run for run in self.manifest.runs} if self.manifest else {}
+        self._settings = {
+            name: run.recipe.unit_settings() for name, run in self._runs.items() if run.recipe is not None
+        }
 
     def check(self, progress: Callable[[int, int], None]) -> int:
         """Checks everything but replays; returns the number of parts checked."""
-        try:
-            self.manifest = read_manifest(self.folder)
-        except ManifestError as error:
-            self._add(MANIFEST, words_after(error, self.folder / MANIFEST))
-        on_disk = {
-            key: match for match in map(PART.match, self.scan.paths()) if match for key in [_key(match)]
-        }
-        keys: set[Key] = set(on_disk)
-        if self.manifest is not None:
-            self.entries = {(entry.task, entry.step): entry for entry in self.manifest.parts}
-            self.tasks = {task.index: task for task in self.manifest.tasks}
-            keys = set(self.entries)
-            for key in sorted(set(on_disk) - keys):
-                self._unnamed_part(on_disk[key].group().rstrip("/"))
-        self._check_groups({task for task, _ in keys})
-        for done, key in enumerate(sorted(keys)):
-            progress(done, len(keys))
-            before = len(self.findings)
-            self._check_part(key)
-            if self.level == "deep" and len(self.findings) == before:
-                self._check_contents(key)
-        progress(len(keys), len(keys))
-        self._check_manifest_values()
-        self._check_odd_and_foreign()
-        return len(keys)
+        entries: dict[str, PartEntry | None] = {part_file(entry.key): entry for entry in self.table.entries()}
+        unnamed = [file for file in self.scan.paths() if key_of_file(file) and file not in entries]
+        if self.manifest is None or self._is_damaged(PARTS_TABLE):
+            entries = dict.fromkeys(unnamed)
+        elif not self.is_written:
+            text = "is a part that the manifest does not name; `tcmrl-data build` takes it in if it holds"
+            for file in unnamed:
+                self._add(file, text, foreign=True)
+        with ThreadPoolExecutor(available_cores()) as pool:
+            checked = pool.map(self._check_part, entries, entries.values())
+            for done, findings in enumerate(checked):
+                progress(done, len(entries))
+                self.findings += findings
+        progress(len(entries), len(entries))
+        if self.level == "deep" and self.manifest is not None:
+            for problem in task_problems(self.tasks, self.manifest.recipe):
+                self._add(TASKS, problem)
+        self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *entries, *unnamed})
+        return len(entries)
 
     def replay(self, number: int) -> tuple[Replay, ...]:
         """Makes parts again and compares; parts with findings are left out."""
-        if self.manifest is None or number <= 0:
-            return ()
-        bad = {(finding.task, finding.step) for finding in self.findings}
+        bad = {finding.file for finding in self.findings}
+        keys = [key for key in self.table if part_file(key) not in bad and self._run(key).recipe is not None]
         replays = []
-        for key in spread_parts([key for key in sorted(self.records) if key not in bad], number):
-            replay = replay_part(self.folder / part_folder(*key), self.records[key], self.manifest)
+        for key in spread_parts(keys, number):
+            recipe = self._run(key).recipe
+            assert recipe is not None
+            with Archive(self.folder / part_file(key)) as archive:
+                replay = replay_part(archive, read_part_record(archive), key, recipe)
             replays.append(replay)
             for problem in replay.problems:
-                self._add(part_folder(*key), f"replay: {problem}")
+                self._add(part_file(key), f"replay: {problem}")
         return tuple(replays)
 
-    def _add(self, file: str, problem: str, *, foreign: bool = False) -> None:
-        match = PART.match(file)
-        task, step = _key(match) if match else (None, None)
-        self.findings.append(Finding(file, problem, task, step, foreign))
-
-    def _unnamed_part(self, place: str) -> None:
-        self.opaque.add(f"{place}/")
-        text = "is a part that the manifest does not name; `tcmrl-data build` takes it in if it holds"
-        self._add(place, text, foreign=True)
-
-    def _check_groups(self, tasks: set[int]) -> None:
-        """The `zarr.json` files above the parts; those of tasks not begun may be missing."""
-        for place, is_needed in {"": True, "tasks/": bool(tasks)}.items():
-            self._check_group(f"{place}zarr.json", is_needed)
-        for task in sorted({*self.tasks, *tasks}):
-            snapshots = Path(part_folder(task, 0)).parent
-            for folder in (snapshots.parent, snapshots):
-                self._check_group(f"{folder}/zarr.json", task in tasks)
-
-    def _check_group(self, file: str, is_needed: bool) -> None:
-        self.expected.add(file)
-        if file not in self.scan.files:
-            if is_needed:
-                self._add(file, "is missing")
-        elif file_problem(self.scan.files[file]) is None and self._read(file, len(GROUP)) not in (
-            GROUP,
-            None,
-        ):
-            self._add(file, "is not the group record that was written here")
-
-    def _check_part(self, key: Key) -> None:
-        place = part_folder(*key)
-        file = f"{place}/part.json"
-        self.expected.add(file)
-        blocked = folder_problem(self.folder, place)
-        if blocked:
-            self._add(place, f"cannot be reached: {blocked[0]} {blocked[1]}")
-            return
+    def _read_manifest(self) -> Manifest | None:
         try:
-            record, sealed = read_sealed_part(self.folder / file)
+            return read_manifest(self.folder)
         except ManifestError as error:
-            self.opaque.add(f"{place}/")
-            self._add(file, words_after(error, self.folder / file))
-            return
-        if self.manifest is not None:
-            entry, task = self.entries[key], self.tasks[key[0]]
-            for problem in identity_problems(record, sealed, entry=entry, task=task, manifest=self.manifest):
-                self._add(file, problem)
-            if sealed != entry.sha256:
-                self.opaque.add(f"{place}/")  # what the record says of other files may be the damage
-                return
-        self.records[key] = record
-        for name, recorded in record.files.items():
-            self._check_file(f"{place}/{name}", recorded.size, recorded.sha256)
-        for name, problem in layout_problems(self.folder / place, record):
-            self._add(f"{place}/{name}".rstrip("/"), problem)
+            self._add(MANIFEST, words_after(error, self.folder / MANIFEST))
+            return None
 
-    def _check_file(self, file: str, size: int, digest: str) -> None:
-        self.expected.add(file)
+    def _read_tables(self) -> tuple[tuple[Task, ...], PartTable]:
+        """The tasks and parts that the manifest seals."""
+        tasks: tuple[Task, ...] = ()
+        table = PartTable.empty()
+        if self.manifest is not None:
+            seals: Mapping[str, TableSeal] = {TASKS: self.manifest.tasks, PARTS_TABLE: self.manifest.parts}
+            for name, seal in seals.items():
+                file = self.folder / name
+                try:
+                    data = read_sealed(file, seal)
+                    if name == TASKS:
+                        tasks = parse_tasks(data, file)
+                    else:
+                        table = parse_parts(data, file)
+                        self._check_table(table, self.manifest)
+                except ManifestError as error:
+                    self._add(name, words_after(error, file))
+        return tasks, table
+
+    def _check_table(self, table: PartTable, manifest: Manifest) -> None:
+        """Compares the manifest's sums with the table."""
+        kept = table.without_tasks(manifest.dropped)
+        expected = {
+            "root": kept.root,
+            "totals.parts": len(kept),
+            "totals.episodes": kept.total("episodes"),
+            "totals.steps": kept.total("steps"),
+            "totals.bytes": kept.total("size"),
+            "complete": len(kept) == manifest.num_expected,
+        }
+        found = manifest.model_dump(include={"root", "totals", "complete"})
+        found |= {f"totals.{name}": value for name, value in found["totals"].items()}
+        for name, value in expected.items():
+            if found[name] != value:
+                self._add(MANIFEST, f"{name} does not agree with {PARTS_TABLE}")
+
+    def _check_part(self, file: str, entry: PartEntry | None) -> list[Finding]:
+        """The findings of one part; `entry` is None where the table cannot tell."""
+        problems = list(self._part_problems(file, entry))
+        return [_finding(file, problem) for problem in problems]
+
+    def _part_problems(self, file: str, entry: PartEntry | None) -> Iterator[str]:
         status = self.scan.files.get(file)
         if status is None:
-            blocked = folder_problem(self.folder, str(Path(file).parent))
-            self._add(file, f"cannot be reached: {blocked[0]} {blocked[1]}" if blocked else "is missing")
-        elif file_problem(status):
-            return  # reported with everything else that is odd
-        elif status.st_size != size:
-            self._add(file, f"has {status.st_size} bytes instead of {size}")
-        elif self.level != "quick":
-            data = self._read(file, size)
-            if data is not None and sha256(data) != digest:
-                self._add(file, "content does not have the recorded sha256")
-
-    def _check_contents(self, key: Key) -> None:
-        place = part_folder(*key)
-        for file, problem in content_problems(self.folder / place, self.records[key], self.manifest):
-            self._add(f"{place}/{file}", problem)
-
-    def _check_manifest_values(self) -> None:
-        """Reference scores against the parts, and with `deep` the tasks against the recipe."""
-        if self.manifest is None:
+            blocked = folder_problem(self.folder, file.rpartition("/")[0])
+            yield f"cannot be reached: {blocked[0]} {blocked[1]}" if blocked else "is missing"
             return
-        for task, recorded in self.manifest.references.items():
-            parts = [record for (index, _), record in sorted(self.records.items()) if str(index) == task]
-            if len(parts) < len(self.manifest.steps):
-                continue
-            own = parts[0].references.model_dump()
-            own |= {"behavior": max(part.statistics.mean for part in parts)}
-            if own != recorded.model_dump():
-                self._add(MANIFEST, f"references of task {task} are not those of its parts")
-        if self.level == "deep":
-            for problem in task_problems(self.manifest):
-                self._add(MANIFEST, problem)
+        odd = file_problem(status)
+        if odd is not None:
+            yield odd
+        elif entry is not None and status.st_size != entry.size:
+            yield f"has {status.st_size} bytes instead of {entry.size}"
+        elif self.level != "quick":
+            try:
+                with Archive(self.folder / file) as archive:
+                    yield from self._archive_problems(archive, entry)
+            except (StoreError, ManifestError) as error:
+                yield words_after(error, self.folder / file)
 
-    def _check_odd_and_foreign(self) -> None:
-        """Files of other kinds (links, pipes, devices), and files that belong to no part."""
+    def _archive_problems(self, archive: Archive, entry: PartEntry | None) -> Iterator[str]:
+        """Problems of an archive whose directory is sound.
+
+        Raises:
+            StoreError: its members are not those of its record.
+            ManifestError: its record cannot be read.
+        """
+        if entry is None:
+            for name in archive.names:
+                archive.read(name)
+        elif sha256(archive.content()) != entry.sha256:
+            yield "content does not have the recorded sha256"
+            return
+        record = read_part_record(archive)
+        check_members(archive, record)
+        if entry is not None:
+            yield from self._record_problems(record, entry)
+        if self.level == "deep":
+            run = self._runs.get(entry.run) if entry else None
+            for name, problem in content_problems(archive, record, run.recipe if run else None):
+                yield f"{name}: {problem}"
+
+    def _record_problems(self, record: PartRecord, entry: PartEntry) -> Iterator[str]:
+        """How a part's record differs from what the dataset says of it."""
+        assert self.manifest is not None
+        run, task = self._runs.get(entry.run), self._tasks_by_index.get(entry.task)
+        if run is None or task is None or entry.platform >= len(self.manifest.platforms):
+            yield "is of a task, a run or a platform that the dataset does not have"
+            return
+        if record.platform != self.manifest.platforms[entry.platform]:
+            yield "was made on another platform than the dataset says"
+        yield from identity_problems(
+            record,
+            entry=entry,
+            task=task,
+            run=run,
+            settings=self._settings.get(entry.run),
+            data_version=self.manifest.data_version,
+        )
+
+    def _check_odd_and_foreign(self, expected: set[str]) -> None:
+        """Files of other kinds (links, pipes, devices), and files that belong to nothing."""
         for file, status in self.scan.files.items():
             problem = file_problem(status)
-            is_foreign = file not in self.expected
-            if problem:
-                self._add(file, problem, foreign=is_foreign)
-            elif is_foreign and not any(file.startswith(place) for place in self.opaque):
-                self._add(file, "belongs to no part", foreign=True)
-        used = {str(parent) for file in self.expected for parent in Path(file).parents}
-        for place in self.scan.empty_folders:
-            if place not in used and not any(f"{place}/".startswith(part) for part in self.opaque):
+            if file not in expected:
+                self._add(file, problem or "belongs to no part", foreign=True)
+            elif problem and key_of_file(file) is None:
+                self._add(file, problem)
+        seals = {TASKS: self.manifest.tasks, PARTS_TABLE: self.manifest.parts} if self.manifest else {}
+        for name, seal in seals.items():
+            if not self.is_written and name in self.scan.files and self.scan.files[name].st_size > seal.bytes:
+                text = "holds lines that the manifest does not seal; `tcmrl-data build` takes them in"
+                self._add(name, text, foreign=True)
+        folders = {Path(file).parent for file in expected}
+        used = {str(parent) for folder in folders for parent in (folder, *folder.parents)}
+        for place in self.scan.empty_folders - used:
+            if not self.is_written:
                 self._add(place, "is a folder that no part has", foreign=True)
         for place, problem in self.scan.problems.items():
             self._add(place, problem, foreign=place not in used)
 
-    def _read(self, file: str, size: int) -> bytes | None:
-        try:
-            return read_plain_file(self.folder / file, limit=max(size, 2**20))
-        except (OSError, ValueError) as error:
-            self._add(file, one_line(error))
-            return None
+    def _run(self, key: PartKey) -> Run:
+        return self._runs[key.run]
+
+    def _is_damaged(self, name: str) -> bool:
+        return any(finding.file == name for finding in self.findings)
+
+    def _add(self, file: str, problem: str, *, foreign: bool = False) -> None:
+        self.findings.append(_finding(file, problem, foreign=foreign))
 
 
-def _key(match: re.Match[str]) -> Key:
-    return int(match[1]), int(match[2])
+def _finding(file: str, problem: str, *, foreign: bool = False) -> Finding:
+    key = key_of_file(file)
+    where = {"task": key.task, "step": key.step, "run": key.run} if key else {}
+    return Finding(file, problem, **where, foreign=foreign)  # type: ignore[arg-type]

@@ -40,19 +40,18 @@ class NpzFormat(Format):
         progress: ExportProgress = no_progress,
     ) -> list[Path]:
         selection = dataset.select(snapshots=snapshots)
-        total, done = sum(len(steps) for steps in selection.steps.values()), 0
+        total, done = sum(map(len, selection.parts.values())), 0
         names = [f"task_{task.index:05d}.npz" for task in selection.tasks]
         with new_folder(out) as folder:
             for task, name in zip(selection.tasks, names, strict=True):
                 np.savez_compressed(folder / name, allow_pickle=False, **_arrays(selection, task))
-                done += len(selection.steps[task.index])
+                done += len(selection.parts[task.index])
                 progress(done, total)
         return [out / name for name in names]
 
 
 def _arrays(selection: Selection, task: Task) -> dict[str, npt.NDArray[Any]]:
-    steps = selection.steps[task.index]
-    parts = [(step, selection.dataset.trajectories(task.index, step)) for step in steps]
+    parts = [(key.step, selection.dataset.trajectories(*key)) for key in selection.parts[task.index]]
     episodes = [(step, episode) for step, part in parts for episode in part]
     lengths = [len(episode) for _, episode in episodes]
     columns = {name: [getattr(episode, name) for _, episode in episodes] for name in _NAMES}

@@ -51,7 +51,7 @@ class Hdf5Format(Format):
         progress: ExportProgress = no_progress,
     ) -> list[Path]:
         selection = dataset.select(snapshots=snapshots)
-        total = sum(len(steps) for steps in selection.steps.values())
+        total = sum(map(len, selection.parts.values()))
         done = 0
         with new_folder(out) as folder:
             for task in selection.tasks:
@@ -97,8 +97,8 @@ def _write_task(selection: Selection, task: Task, path: Path) -> Iterator[int]:
     with h5py.File(path, "x") as file:
         file.attrs.update(_attributes(selection, task))
         groups = file.create_group("episodes")
-        for step in selection.steps[task.index]:
-            trajectories = selection.dataset.trajectories(task.index, step)
+        for key in selection.parts[task.index]:
+            step, trajectories = key.step, selection.dataset.trajectories(*key)
             require_room_for(path, trajectories)
             first = len(groups)
             _append(file, _flat(trajectories, first=first, step=step))
@@ -118,7 +118,7 @@ def _attributes(selection: Selection, task: Task) -> Mapping[str, Any]:
         "split": task.split,
         "parameters": json.dumps(dict(task.parameters), sort_keys=True),
         "seed": manifest.seed,
-        "snapshots": np.array(selection.steps[task.index], dtype=np.int64),
+        "snapshots": np.array([key.step for key in selection.parts[task.index]], dtype=np.int64),
         "dataset_root": manifest.root,
         "recipe": json.dumps(manifest.recipe.unit_settings(), sort_keys=True),
         "citation": manifest.recipe.about.citation,

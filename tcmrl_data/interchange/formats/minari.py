@@ -15,6 +15,7 @@ import json
 import os
 import warnings
 from collections.abc import Iterator, Mapping
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
 
@@ -25,7 +26,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 
-from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.dataset import Dataset, TaskReferences
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import make_environment
 from tcmrl_data.envs.tasks import Task
@@ -34,7 +35,7 @@ from tcmrl_data.foundation.errors import MissingPackageError, StoreError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
 from tcmrl_data.interchange.formats.new_folder import new_folder, require_room_for
-from tcmrl_data.store.manifest import TaskReferences
+from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
@@ -72,7 +73,7 @@ class MinariFormat(Format):
                 f"format 'minari' needs a package that is missing ({error}); pip install 'tcmrl[minari]'"
             ) from None
         selection = dataset.select(snapshots=snapshots)
-        total = sum(len(steps) for steps in selection.steps.values())
+        total = sum(map(len, selection.parts.values()))
         done = 0
         with new_folder(out) as folder, _datasets_path(folder):
             for task in selection.tasks:
@@ -132,24 +133,24 @@ def _write_task(selection: Selection, task: Task, name: str, folder: Path) -> It
     """Writes a task part by part; yields the step of every part written."""
     import minari
 
-    dataset, steps = selection.dataset, selection.steps[task.index]
+    dataset = selection.dataset
     require_room_for(folder / "namespace_metadata.json")
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`.*` is set to None", UserWarning)  # author and link are unknown
         written = minari.create_dataset_from_buffers(name, [], **_description(selection, task))
     source, _ = _best(dataset.references(task.index))
     written.storage.update_metadata({"ref_max_score_source": source, "dataset_root": dataset.manifest.root})
-    for step in steps:
-        trajectories = dataset.trajectories(task.index, step)
+    for key in selection.parts[task.index]:
+        trajectories = dataset.trajectories(*key)
         require_room_for(folder / name / "data" / "main_data.hdf5", trajectories)
         first = written.total_episodes
         written.update_dataset_from_buffer(
-            [_buffer(dataset, task, step, index, trajectory) for index, trajectory in enumerate(trajectories)]
+            [_buffer(dataset, key, index, trajectory) for index, trajectory in enumerate(trajectories)]
         )
         written.storage.update_episode_metadata(
-            [{"snapshot_step": step}] * len(trajectories), range(first, first + len(trajectories))
+            [{"snapshot_step": key.step}] * len(trajectories), range(first, first + len(trajectories))
         )
-        yield step
+        yield key.step
 
 
 def _description(selection: Selection, task: Task) -> dict[str, Any]:
@@ -162,7 +163,8 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
         kwargs={"settings": recipe.environment.model_dump(mode="json"), "parameters": dict(task.parameters)},
     )
     references = dataset.references(task.index)
-    packages = dataset.part(task.index, selection.steps[task.index][0]).provenance["packages"]
+    platform = dataset.manifest.platforms[dataset.entry(selection.parts[task.index][0]).platform]
+    packages = {"tcmrl": version("tcmrl"), **platform.packages}
     return {
         "env": spec,
         "eval_env": spec,
@@ -193,17 +195,17 @@ def _best(references: TaskReferences) -> tuple[str, float]:
     return "behavior", references.behavior
 
 
-def _buffer(dataset: Dataset, task: Task, step: int, episode: int, trajectory: Trajectory) -> "EpisodeBuffer":
+def _buffer(dataset: Dataset, key: PartKey, episode: int, trajectory: Trajectory) -> "EpisodeBuffer":
     from minari.data_collector import EpisodeBuffer
 
     if not len(trajectory):
         raise StoreError(
-            f"{dataset.folder_of(task.index, step)}: episode {episode} has no steps, which Minari cannot "
+            f"{dataset.file_of(key)}: episode {episode} has no steps, which Minari cannot "
             "hold; export with --format hdf5"
         )
-    key = (dataset.manifest.seed, dataset.name, task.index)
+    part = dataset.part(*key)
     return EpisodeBuffer(
-        seed=keyed_seed(*key, Purpose.ROLLOUT_RESET, step, episode),
+        seed=keyed_seed(part.identity.seed, dataset.name, key.task, Purpose.ROLLOUT_RESET, key.step, episode),
         observations=trajectory.observations,
         actions=trajectory.actions,
         rewards=trajectory.rewards,

@@ -33,12 +33,12 @@ def to_sb3_buffer(selection: Selection, task: int, *, device: str = "cpu") -> "R
     """
     from stable_baselines3.common.buffers import ReplayBuffer
 
-    trajectories = selection.trajectories(task) if task in selection.steps else []
+    trajectories = selection.trajectories(task) if task in selection.parts else []
     size = sum(map(len, trajectories))
     if not size:
         raise SelectionError(
             f"{selection.dataset.folder}: the selection holds no transition of task {task}; it has the tasks "
-            f"{sorted(selection.steps)}"
+            f"{sorted(selection.parts)}"
         )
     environment = selection.dataset.environment
     buffer = ReplayBuffer(

@@ -38,10 +38,10 @@ def to_tensordict(selection: Selection) -> "TensorDict":
 
     kind = _tensordict_type()
     episodes = [
-        (task.index, step, trajectory)
+        (task.index, key.step, trajectory)
         for task in selection.tasks
-        for step in selection.steps[task.index]
-        for trajectory in selection.dataset.trajectories(task.index, step)
+        for key in selection.parts[task.index]
+        for trajectory in selection.dataset.trajectories(*key)
     ]
     lengths = [len(episode) for _, _, episode in episodes]
 

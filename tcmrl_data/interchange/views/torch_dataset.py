@@ -13,6 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Dataset
 
 from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.selection import Selection
@@ -42,10 +43,9 @@ class TrajectoryDataset(Dataset[Item]):
 
     def __init__(self, selection: "Selection", *, kept_parts: int | None = None) -> None:
         self._dataset, self._kept_parts = selection.dataset, kept_parts
-        self._parts = [(task.index, step) for task in selection.tasks for step in selection.steps[task.index]]
-        arrays = [self._dataset.part(*key).identity.arrays for key in self._parts]
-        self._ends = list(accumulate(part["episode_offsets"].shape[0] - 1 for part in arrays))
-        self._read: OrderedDict[tuple[int, int], list[Trajectory]] = OrderedDict()
+        self._parts = [key for task in selection.tasks for key in selection.parts[task.index]]
+        self._ends = list(accumulate(self._dataset.entry(key).episodes for key in self._parts))
+        self._read: OrderedDict[PartKey, list[Trajectory]] = OrderedDict()
 
     def __len__(self) -> int:
         return self._ends[-1]
@@ -55,13 +55,12 @@ class TrajectoryDataset(Dataset[Item]):
             raise IndexError(f"episode {index} of {len(self)}")
         index %= len(self)
         part = bisect_right(self._ends, index)
-        task, step = self._parts[part]
-        trajectories = self._trajectories(task, step)
-        return _item(trajectories[index - self._ends[part]], task, step)
+        key = self._parts[part]
+        return _item(self._trajectories(key)[index - self._ends[part]], key.task, key.step)
 
-    def _trajectories(self, task: int, step: int) -> list[Trajectory]:
-        found = self._read.pop((task, step), None) or self._dataset.trajectories(task, step)
-        self._read[task, step] = found
+    def _trajectories(self, key: PartKey) -> list[Trajectory]:
+        found = self._read.pop(key, None) or self._dataset.trajectories(*key)
+        self._read[key] = found
         if self._kept_parts is not None and len(self._read) > self._kept_parts:
             self._read.popitem(last=False)
         return found

@@ -1,0 +1,306 @@
+"""What a dataset holds while it is built: its tables and its manifest, written by the driver alone."""
+
+import os
+import time
+from collections.abc import Collection, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.build.published import Published, read_published
+from tcmrl_data.foundation.disk import STAGING, replace_file
+from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError, TcmrlError
+from tcmrl_data.foundation.machine import available_cores
+from tcmrl_data.foundation.plain_files import file_problem, folder_problem
+from tcmrl_data.recipe.recipe import full_settings
+from tcmrl_data.store.archive import Archive
+from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_file, part_folder
+from tcmrl_data.store.limits import MAX_PLATFORMS
+from tcmrl_data.store.manifest import MANIFEST, MANIFEST_SCHEMA, Run, Totals, read_manifest, seal
+from tcmrl_data.store.part_record import DATA_VERSION
+from tcmrl_data.store.part_table import (
+    HEADER,
+    PARTS_TABLE,
+    PartEntry,
+    PartTable,
+    parse_entries,
+    parse_parts,
+    part_line,
+)
+from tcmrl_data.store.tables import TableWriter, read_log, read_sealed
+from tcmrl_data.store.task_table import TASKS, parse_tasks, task_line
+
+SEAL_SECONDS = 1.0
+SEAL_SHARE = 0.05
+"""While parts arrive, the manifest is written every second at most, and in this share of the time at most."""
+
+
+class Ledger:
+    """The tables and the manifest of a dataset that is being built.
+
+    Args:
+        plan: what to build; tasks that the dataset has already are taken from there.
+        out: the dataset's folder. Nothing is written before `begin`.
+        taken_up: indices of tasks that belong to the dataset even if it has dropped them.
+
+    Attributes:
+        plan: with the tasks of the dataset.
+        platforms: on which parts were made.
+        num_parts: parts that are there, of those that the plan calls for.
+        num_tasks_done: tasks of which no part is missing.
+        damaged: files of parts that nothing had recorded when they were damaged; `begin` deletes them.
+
+    Raises:
+        ManifestError: the manifest or a table is damaged.
+        StoreError: a recorded part is missing or of another size, or a part is not of the plan.
+    """
+
+    def __init__(self, plan: BuildPlan, out: Path, *, taken_up: Collection[int] = ()) -> None:
+        self._out = out
+        self._earlier = read_manifest(out) if (out / MANIFEST).is_file() else None
+        tasks, parts, log = b"", b"", b""
+        if self._earlier is not None:
+            tasks = read_sealed(out / TASKS, self._earlier.tasks)
+            parts = read_sealed(out / PARTS_TABLE, self._earlier.parts)
+            log = read_log(out / PARTS_TABLE, self._earlier.parts)
+        self.platforms = list(self._earlier.platforms) if self._earlier else []
+        recorded = parse_tasks(tasks, out / TASKS)
+        dropped = {*self._earlier.dropped} if self._earlier else set()
+        self.plan = plan.with_recorded(recorded, dropped=dropped - {*taken_up})
+        known = {task.index for task in recorded}
+        self._new_tasks = [task for task in self.plan.tasks if task.index not in known]
+        self._task_writer = TableWriter(out / TASKS, tasks)
+        self._part_writer = TableWriter(out / PARTS_TABLE, parts)
+        self._table = parse_parts(parts or HEADER, out / PARTS_TABLE)
+        self._new: list[PartEntry] = []
+        self._found: list[Published] = []
+        self.damaged: list[Path] = []
+        self._steps = {task.index: set[int]() for task in self.plan.wanted}
+        self.num_parts = self.num_tasks_done = 0
+        self._sealed, self._seal_seconds = time.monotonic(), 0.0
+        self._find_parts(log)
+
+    @property
+    def root(self) -> str:
+        """Root of the parts that are there."""
+        return self._kept_parts().root
+
+    @property
+    def num_missing(self) -> int:
+        """Parts that are still to be made."""
+        return len(self._steps) * len(self.plan.source.steps) - self.num_parts
+
+    def missing(self, task: int) -> list[PartKey]:
+        """The parts of a task that are still to be made; none of a dropped task."""
+        steps = self._steps.get(task)
+        return [] if steps is None else [PartKey(task, s) for s in self.plan.source.steps if s not in steps]
+
+    def begin(self) -> None:
+        """Writes down what was found, deletes damaged parts that nothing recorded, and seals the manifest.
+
+        Raises:
+            ReadOnlyError: the folder cannot be written.
+            StorageError: the operating system refuses an operation.
+        """
+        for file in self.damaged:
+            file.unlink()
+        self._task_writer.append(b"".join(map(task_line, self._new_tasks)))
+        self._new_tasks = []
+        if self._earlier is None:
+            self._part_writer.append(HEADER)
+        found, self._found = self._found, []
+        for published in found:
+            self._record(published)
+        self.seal()
+
+    def take_in(self, published: Published) -> bool:
+        """Adds a part that a worker has published; returns False if it is there already.
+
+        Its content is not read again: the worker hashed what it wrote. The file has to be there, of the size
+        that the worker wrote, with a valid directory.
+
+        Raises:
+            StoreError: the file is not what the worker wrote.
+        """
+        key = published.entry.key
+        if key.step in self._steps[key.task]:
+            return False
+        with Archive(self._out / part_file(key)) as archive:
+            if archive.size != published.entry.size:
+                raise StoreError(
+                    f"{archive.path} has {archive.size} bytes, its worker wrote {published.entry.size}"
+                )
+        self._add(key)
+        self._record(published)
+        wait = max(SEAL_SECONDS, self._seal_seconds / SEAL_SHARE)
+        if time.monotonic() - self._sealed > wait:
+            self.seal()
+        return True
+
+    def take_in_unreported(self, task: int) -> None:
+        """Adds the parts of a task whose reports were lost; damaged ones count as missing."""
+        for key in self.missing(task):
+            file = self._out / part_file(key)
+            if file.exists():
+                published = self._read(key)
+                if published is not None:
+                    self._add(key)
+                    self._record(published)
+
+    def is_sealed(self) -> bool:
+        """Whether the manifest on disk says all that is known here."""
+        nothing_new = not (self._new_tasks or self._new or self._found or self.damaged)
+        return nothing_new and self._is_written(self._manifest())
+
+    def seal(self) -> None:
+        """Writes the manifest, unless it stands there already.
+
+        Raises:
+            StorageError: the operating system refuses an operation; the old manifest is unchanged.
+        """
+        began = time.monotonic()
+        self._table, self._new = self._table.with_entries(self._new), []
+        data = self._manifest()
+        if not self._is_written(data):
+            self._task_writer.sync()
+            self._part_writer.sync()
+            replace_file(self._out / MANIFEST, data, staging=self._out / STAGING)
+        self._sealed = time.monotonic()
+        self._seal_seconds = self._sealed - began
+
+    def _is_of_recipe(self, recorded: Mapping[str, Any]) -> bool:
+        """Whether recorded settings are the plan's, with defaults where they lack a field."""
+        try:
+            return full_settings(recorded) == full_settings(self.plan.recipe.unit_settings())
+        except TcmrlError:
+            return False
+
+    def _is_written(self, data: bytes) -> bool:
+        file = self._out / MANIFEST
+        return file.is_file() and file.read_bytes() == data
+
+    def _kept_parts(self) -> PartTable:
+        """The parts of the tasks that were not dropped."""
+        found = [published.entry for published in self._found]
+        return self._table.with_entries([*self._new, *found]).without_tasks(self.plan.dropped)
+
+    def _manifest(self) -> bytes:
+        """The manifest of what is there."""
+        plan, earlier, table = self.plan, self._earlier, self._kept_parts()
+        main = Run(name=MAIN_RUN, kind="built", seed=plan.seed, recipe=plan.recipe, steps=plan.source.steps)
+        totals = Totals(
+            parts=len(table),
+            episodes=table.total("episodes"),
+            steps=table.total("steps"),
+            bytes=table.total("size"),
+        )
+        fields = {
+            "schema_version": MANIFEST_SCHEMA,
+            "name": plan.environment.name,
+            "label": earlier.label if earlier else None,
+            "data_version": DATA_VERSION,
+            "runs": [main.model_dump(mode="json")],
+            "derivation": None,
+            "platforms": [platform.model_dump(mode="json") for platform in self.platforms],
+            "tasks": self._task_writer.seal.model_dump(),
+            "parts": self._part_writer.seal.model_dump(),
+            "dropped": sorted(plan.dropped),
+            "totals": totals.model_dump(),
+            "root": table.root,
+            "complete": not self.num_missing,
+        }
+        return seal(fields)
+
+    def _record(self, published: Published) -> None:
+        """Appends a part's line to the table."""
+        digest = published.platform.digest()
+        digests = [platform.digest() for platform in self.platforms]
+        if digest not in digests:
+            if len(self.platforms) >= MAX_PLATFORMS:
+                raise BuildError(
+                    f"{self._out}: was built on {MAX_PLATFORMS} platforms, and no more are allowed"
+                )
+            self.platforms.append(published.platform)
+            digests.append(digest)
+            self.seal()  # lines behind the seal name platforms by their position in the manifest
+        entry = published.entry._replace(platform=digests.index(digest))
+        self._part_writer.append(part_line(entry))
+        self._new.append(entry)
+
+    def _add(self, key: PartKey) -> None:
+        """Counts a part."""
+        steps = self._steps[key.task]
+        steps.add(key.step)
+        self.num_parts += 1
+        self.num_tasks_done += len(steps) == len(self.plan.source.steps)
+
+    def _find_parts(self, log: bytes) -> None:
+        """Compares the tables with the files, and finds the parts that the tables do not name.
+
+        Raises:
+            StoreError: a recorded part is missing or of another size.
+        """
+        sizes = dict(self._scan())
+        wanted = {PartKey(task, step) for task in self._steps for step in self.plan.source.steps}
+        for key, size in zip(self._table, self._table.columns["size"].tolist(), strict=True):
+            if key in wanted:
+                self._check_size(key, sizes.pop(key, None), size)
+                self._add(key)
+        for entry in parse_entries(log):
+            known = entry.platform < len(self.platforms) and sizes.get(entry.key) == entry.size
+            if known and entry.key in wanted:
+                del sizes[entry.key]
+                self._found.append(Published(entry, self.platforms[entry.platform]))
+        with ThreadPoolExecutor(available_cores()) as pool:
+            unnamed = pool.map(self._read, sorted(wanted & sizes.keys()))
+            self._found += [published for published in unnamed if published is not None]
+        for published in self._found:
+            self._add(published.entry.key)
+
+    def _scan(self) -> Iterator[tuple[PartKey, int]]:
+        """The keys and sizes of all archives in the folders of the wanted tasks.
+
+        Raises:
+            StoreError: a folder or an archive is a link or something else that no build makes.
+        """
+        for task in self._steps:
+            place = part_folder(PartKey(task, 0))
+            if not os.path.lexists(self._out / place):
+                continue
+            blocked = folder_problem(self._out, place)
+            if blocked:
+                raise StoreError(f"{self._out / blocked[0]} {blocked[1]}; delete it")
+            with os.scandir(self._out / place) as entries:
+                for entry in entries:
+                    key = key_of_file(f"{place}/{entry.name}")
+                    if key is not None:
+                        status = entry.stat(follow_symlinks=False)
+                        problem = file_problem(status)
+                        if problem:
+                            raise StoreError(f"{self._out / place / entry.name} {problem}; delete it")
+                        yield key, status.st_size
+
+    def _check_size(self, key: PartKey, found: int | None, recorded: int) -> None:
+        if found != recorded:
+            problem = "is missing" if found is None else f"has {found} bytes instead of {recorded}"
+            raise StoreError(f"{self._out / part_file(key)} {problem}; run `tcmrl-data repair {self._out}`")
+
+    def _read(self, key: PartKey) -> Published | None:
+        """A part that the tables do not name; None if it is damaged.
+
+        Raises:
+            StoreError: it is a sound part, but of other settings, another seed or another task.
+        """
+        file = self._out / part_file(key)
+        try:
+            published, record = read_published(file, key.run)
+        except (StoreError, ManifestError):
+            self.damaged.append(file)
+            return None
+        identity = record.identity
+        if (identity.task, identity.step, identity.seed) != (key.task, key.step, self.plan.seed):
+            raise StoreError(f"{file}: holds another part; delete it")
+        if identity.data_version != DATA_VERSION or not self._is_of_recipe(identity.settings):
+            raise StoreError(f"{file}: was built with other settings; delete it")
+        return published

@@ -1,0 +1,161 @@
+"""The record of a part, `part.json` in its archive: its identity, what it holds, and where it was made."""
+
+import re
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from tcmrl_data.foundation.canonical import digest, parse_json
+from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.foundation.plain_files import one_line
+from tcmrl_data.foundation.records import Record, parse_record
+from tcmrl_data.store.archive import Archive
+from tcmrl_data.store.limits import MAX_ARRAYS, MAX_COUNT, MAX_INDEX, PART_RECORD_BYTES
+from tcmrl_data.store.platform import Platform
+
+PART_SCHEMA = 2
+"""Raised when the meaning or the layout of a part's files changes; no part of the identity."""
+
+DATA_VERSION = 2
+"""Raised by hand when the code's data change for the same recipe and seed."""
+
+RECORD = "part.json"
+SHA256 = r"^[0-9a-f]{64}$"
+
+STANDARD_ARRAYS = {
+    "observations": ("float32", 2),
+    "actions": ("float32", 2),
+    "rewards": ("float32", 1),
+    "terminated": ("bool", 1),
+    "truncated": ("bool", 1),
+    "episode_offsets": ("int64", 1),
+}
+"""dtype and rank of the arrays of every part; an environment's extra arrays have rank 1."""
+
+_ARRAY_NAME = r"[a-z0-9_]{1,64}"
+
+
+class ArrayRecord(Record):
+    """dtype, shape and sha256 of an array's decoded bytes."""
+
+    dtype: Literal["float32", "int64", "bool"]
+    shape: tuple[int, ...]
+    sha256: str = Field(pattern=SHA256)
+
+
+class Identity(Record):
+    """What makes a part this part; its digest is the part's id.
+
+    The name of the run is not in it: a part keeps its id and its bytes in whichever dataset it lies.
+
+    Attributes:
+        settings: the recipe's environment, behavior and rollouts.
+        task: index of the task.
+        parameters: its parameters.
+        step: snapshot step.
+        seed: root seed of the build; episode seeds are keyed by (environment, task, purpose, step, episode).
+        policy: digest of the snapshot.
+        arrays: decoded contents.
+        derived: how the part was made from other parts; null for rollouts of its own policy.
+    """
+
+    data_version: int
+    settings: dict[str, Any]
+    task: int = Field(ge=0, lt=MAX_INDEX)
+    parameters: dict[str, Any]
+    step: int = Field(ge=0, lt=MAX_INDEX)
+    seed: int = Field(ge=0)
+    policy: str = Field(pattern=SHA256)
+    arrays: dict[str, ArrayRecord] = Field(max_length=MAX_ARRAYS)
+    derived: dict[str, Any] | None = None
+
+    @field_validator("arrays")
+    @classmethod
+    def _arrays_form_episodes(cls, arrays: dict[str, ArrayRecord]) -> dict[str, ArrayRecord]:
+        for name, (dtype, rank) in STANDARD_ARRAYS.items():
+            if name not in arrays:
+                raise ValueError(f"{name} is missing")
+            if (arrays[name].dtype, len(arrays[name].shape)) != (dtype, rank):
+                raise ValueError(f"{name} must be {dtype} of rank {rank}")
+        steps, episodes = arrays["actions"].shape[0], arrays["episode_offsets"].shape[0] - 1
+        rows = {"observations": steps + episodes, "episode_offsets": episodes + 1}
+        for name, record in arrays.items():
+            if not re.fullmatch(_ARRAY_NAME, name):
+                raise ValueError(f"{name[:80]!r} is no array name")
+            if name not in STANDARD_ARRAYS and len(record.shape) != 1:
+                raise ValueError(f"{name} must be of rank 1")
+            if record.shape[0] != rows.get(name, steps) or episodes < 1 or min(record.shape) < 0:
+                raise ValueError(f"{name}: shape {list(record.shape)} does not fit {steps} steps")
+        return arrays
+
+
+class Statistics(Record):
+    """Undiscounted returns over a part's episodes, and moments that merge over parts.
+
+    Attributes:
+        quantiles: at 0, 10, 25, 50, 75, 90, 100 percent.
+        success_rate: share of episodes with a success at any step; null without a success signal.
+        moments: array name to count, and per-column sums and sums of squares, in double precision.
+    """
+
+    episodes: int = Field(ge=0, lt=MAX_COUNT)
+    steps: int = Field(ge=0, lt=MAX_COUNT)
+    mean: float
+    std: float
+    min: float
+    max: float
+    quantiles: tuple[float, ...]
+    success_rate: float | None
+    moments: dict[str, dict[str, Any]]
+
+
+class References(Record):
+    """Mean returns to compare results with, over the recipe's number of episodes.
+
+    Attributes:
+        uniform: uniform actions.
+        oracle: a controller that knows the task; null where none can be computed.
+        scripted: the environment's noise-free expert; null where there is none.
+    """
+
+    uniform: float
+    oracle: float | None
+    scripted: float | None
+
+
+class PartRecord(Record):
+    """`part.json`.
+
+    Attributes:
+        id: digest of the identity.
+        behavior: what the behavior source records with its parts.
+        platform: what the part was made on; parts made on equal platforms are equal byte for byte.
+    """
+
+    schema_version: int
+    id: str = Field(pattern=SHA256)
+    identity: Identity
+    statistics: Statistics
+    references: References
+    behavior: dict[str, Any]
+    platform: Platform
+
+
+def read_part_record(archive: Archive) -> PartRecord:
+    """Reads `part.json` of a part and checks that its id is its identity's digest.
+
+    Raises:
+        StoreError: the archive is damaged or holds no record.
+        ManifestError: names the file and the field.
+    """
+    place = archive.place(RECORD)
+    try:
+        values = parse_json(archive.read(RECORD, limit=PART_RECORD_BYTES))
+    except ValueError as error:
+        raise ManifestError(
+            f"{place}: not a part record ({one_line(error)}); run `tcmrl-data repair`"
+        ) from None
+    record = parse_record(PartRecord, values, place, version=PART_SCHEMA)
+    if record.id != digest(values["identity"]):
+        raise ManifestError(f"{place}: id is not the digest of its identity; run `tcmrl-data repair`")
+    return record

@@ -1,0 +1,118 @@
+"""Tables of a dataset: files of JSON lines, of which the manifest seals a beginning.
+
+A build appends a line per published part, which takes the same time however many there are, and seals what
+stands there from time to time. Lines behind the sealed ones are its log: after a crash the next build reads
+them again. Readers read the sealed lines only.
+"""
+
+import hashlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+from tcmrl_data.foundation.disk import disk, named_errors
+from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.foundation.plain_files import one_line, read_plain_prefix
+from tcmrl_data.store.limits import LINE_BYTES, MAX_COUNT
+from tcmrl_data.store.manifest import TableSeal
+
+BLOCK_BYTES = 2**20
+"""Lines are parsed in blocks of about this size, so that parsed lines take little memory."""
+
+
+def read_sealed(file: Path, seal: TableSeal) -> bytes:
+    """The sealed lines of a table.
+
+    Raises:
+        ManifestError: the file is missing or damaged, or is no plain file; the message names it.
+    """
+    data = _read(file, seal.bytes)
+    found = hashlib.sha256(data).hexdigest()
+    if len(data) != seal.bytes or found != seal.sha256 or data.count(b"\n") != seal.lines:
+        raise ManifestError(
+            f"{file}: its first {seal.bytes} bytes are not those that the manifest seals; "
+            "run `tcmrl-data repair`"
+        )
+    return data
+
+
+def seal_of(lines: bytes) -> TableSeal:
+    """The seal of a table that consists of the given lines."""
+    digest = hashlib.sha256(lines).hexdigest()
+    return TableSeal(lines=lines.count(b"\n"), bytes=len(lines), sha256=digest)
+
+
+def read_log(file: Path, seal: TableSeal) -> bytes:
+    """The complete lines behind the sealed ones.
+
+    Raises:
+        ManifestError: the file is missing, or is no plain file; the message names it.
+    """
+    data = _read(file, MAX_COUNT)[seal.bytes :]
+    return data[: data.rfind(b"\n") + 1]
+
+
+def blocks(data: bytes, file: Path) -> Iterator[bytes]:
+    """Splits lines into JSON arrays of many lines each.
+
+    Raises:
+        ManifestError: a line is too long; the message names the file.
+    """
+    start = 0
+    while start < len(data):
+        end = data.rfind(b"\n", start, start + BLOCK_BYTES)
+        if end < 0:
+            raise ManifestError(f"{file}: a line has more than {LINE_BYTES} bytes")
+        yield b"[" + data[start:end].replace(b"\n", b",") + b"]"
+        start = end + 1
+
+
+def _read(file: Path, num_bytes: int) -> bytes:
+    try:
+        return read_plain_prefix(file, num_bytes)
+    except FileNotFoundError:
+        raise ManifestError(f"{file} is missing; run `tcmrl-data repair`") from None
+    except (OSError, ValueError) as error:
+        raise ManifestError(f"{file}: {one_line(error)}") from None
+
+
+class TableWriter:
+    """Appends lines to a table that the manifest then seals.
+
+    Args:
+        file: the table; created if it does not exist.
+        lines: the complete lines that stand there and are kept; what follows them is cut off.
+    """
+
+    def __init__(self, file: Path, lines: bytes = b"") -> None:
+        self._file = file
+        self._hash = hashlib.sha256(lines)
+        self._lines, self._bytes = lines.count(b"\n"), len(lines)
+
+    def append(self, lines: bytes) -> None:
+        """Writes complete lines behind the others; not forced to disk before they are sealed.
+
+        Raises:
+            StorageError: the operating system refuses the operation; the lines do not count then.
+        """
+        if lines:
+            with named_errors(self._file):
+                disk.write_at(self._file, self._bytes, lines)
+            self._hash.update(lines)
+            self._lines, self._bytes = self._lines + lines.count(b"\n"), self._bytes + len(lines)
+
+    def sync(self) -> None:
+        """Forces the lines to disk, and cuts off what stands behind them.
+
+        Raises:
+            StorageError: the operating system refuses the operation.
+        """
+        with named_errors(self._file):
+            if self._file.stat().st_size > self._bytes:
+                os.truncate(self._file, self._bytes)
+            disk.sync(self._file)
+
+    @property
+    def seal(self) -> TableSeal:
+        """The seal of the lines; to be published after `sync`."""
+        return TableSeal(lines=self._lines, bytes=self._bytes, sha256=self._hash.hexdigest())

@@ -1,0 +1,71 @@
+"""`tasks.jsonl`: the tasks of a dataset, one JSON object a line."""
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import FailFast, Field, TypeAdapter, ValidationError
+
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.foundation.canonical import canonical_json
+from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.records import Record, hidden_text
+from tcmrl_data.foundation.validation import first_problem
+from tcmrl_data.store.limits import MAX_INDEX
+from tcmrl_data.store.tables import blocks
+
+TASKS = "tasks.jsonl"
+
+
+class TaskRecord(Record):
+    """A task of the dataset."""
+
+    index: int = Field(ge=0, lt=MAX_INDEX)
+    split: Literal["train", "test"]
+    parameters: dict[str, Any]
+
+
+_RECORDS = TypeAdapter(Annotated[list[TaskRecord], FailFast()])
+
+
+def task_line(task: Task) -> bytes:
+    """A task as a line of the table."""
+    return canonical_json({"index": task.index, "split": task.split, "parameters": dict(task.parameters)})
+
+
+def parse_tasks(data: bytes, file: Path) -> tuple[Task, ...]:
+    """The tasks of a table's lines, ascending by index.
+
+    Args:
+        data: complete lines.
+        file: the table, for error messages.
+
+    Raises:
+        ManifestError: lines that were not written here, or a task that stands there twice.
+    """
+    tasks = [
+        Task(record.index, record.split, record.parameters)
+        for block in blocks(data, file)
+        for record in _parse_block(block, file)
+    ]
+    if b"".join(map(task_line, tasks)) != data:
+        raise ManifestError(f"{file}: its lines are not written as canonical JSON")
+    ordered = sorted(tasks, key=lambda task: task.index)
+    if len({task.index for task in tasks}) < len(tasks):
+        raise ManifestError(f"{file}: a task stands there twice")
+    return tuple(ordered)
+
+
+def _parse_block(block: bytes, file: Path) -> Iterable[TaskRecord]:
+    try:
+        records = _RECORDS.validate_json(block, strict=True)
+    except ValidationError as error:
+        raise ManifestError(f"{file}: {printable(first_problem(error))[:500]}") from None
+    # canonical JSON escapes every character outside printable ASCII, except DEL
+    if b"\\" in block or b"\x7f" in block:
+        hidden = hidden_text([record.parameters for record in records])
+        if hidden:
+            place = printable(hidden)[:200]
+            raise ManifestError(f"{file}: {place} holds control characters, which a terminal would obey")
+    return records

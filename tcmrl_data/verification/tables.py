@@ -1,0 +1,107 @@
+"""Writing the tables of a dataset again, from the parts or with other lines for some of them."""
+
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from tcmrl_data.build.published import Published, read_published
+from tcmrl_data.envs.tasks import Task, draw_tasks
+from tcmrl_data.foundation.disk import STAGING, replace_file
+from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
+from tcmrl_data.foundation.machine import available_cores
+from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.store.keys import PartKey, key_of_file, part_file
+from tcmrl_data.store.manifest import MANIFEST, Manifest, seal
+from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartEntry, PartTable, parse_parts, part_line
+from tcmrl_data.store.platform import Platform
+from tcmrl_data.store.tables import read_sealed, seal_of
+from tcmrl_data.store.task_table import TASKS, parse_tasks, task_line
+from tcmrl_data.verification.scan import scan_dataset
+
+
+def restore_tables(folder: Path, manifest: Manifest) -> None:
+    """Writes damaged tables again, from the parts and the recipe.
+
+    Raises:
+        BuildError: what was found does not have the manifest's root, or not its number of tasks; nothing was
+            written.
+    """
+    platforms = list(manifest.platforms)
+    try:
+        table = parse_parts(read_sealed(folder / PARTS_TABLE, manifest.parts), folder / PARTS_TABLE)
+    except ManifestError:
+        table = PartTable.empty().with_entries(numbered(_read_parts(folder), platforms))
+    try:
+        tasks = parse_tasks(read_sealed(folder / TASKS, manifest.tasks), folder / TASKS)
+    except ManifestError:
+        tasks = _draw_again(table, manifest)
+    if len(tasks) != manifest.tasks.lines or table.without_tasks(manifest.dropped).root != manifest.root:
+        raise BuildError(
+            f"{folder}: its tables are damaged, and what its parts tell does not have the manifest's root; "
+            f"delete {MANIFEST} and run the first `tcmrl-data build` again, which keeps the sound parts"
+        )
+    write_tables(folder, manifest, tasks=tasks, table=table, platforms=platforms)
+
+
+def write_tables(
+    folder: Path,
+    manifest: Manifest,
+    *,
+    tasks: Sequence[Task],
+    table: PartTable,
+    platforms: Sequence[Platform],
+) -> None:
+    """Replaces the tables and then the manifest that seals them.
+
+    If this is interrupted the tables are not those of the manifest, and `restore_tables` finds them again.
+    """
+    tables = {
+        TASKS: b"".join(map(task_line, tasks)),
+        PARTS_TABLE: HEADER + b"".join(map(part_line, table.entries())),
+    }
+    for name, data in tables.items():
+        replace_file(folder / name, data, staging=folder / STAGING)
+    fields = manifest.model_dump(mode="json", exclude={"digest"})
+    fields |= {"platforms": [platform.model_dump(mode="json") for platform in platforms]}
+    fields |= {
+        "tasks": seal_of(tables[TASKS]).model_dump(),
+        "parts": seal_of(tables[PARTS_TABLE]).model_dump(),
+    }
+    kept = table.without_tasks(manifest.dropped)
+    fields["totals"]["bytes"] = kept.total("size")
+    replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
+
+
+def numbered(parts: Iterable[Published], platforms: list[Platform]) -> list[PartEntry]:
+    """The parts' lines with the positions of their platforms; adds new platforms to the list."""
+    positions = {platform.digest(): position for position, platform in enumerate(platforms)}
+    entries = []
+    for part in parts:
+        position = positions.setdefault(part.platform.digest(), len(platforms))
+        if position == len(platforms):
+            platforms.append(part.platform)
+        entries.append(part.entry._replace(platform=position))
+    return entries
+
+
+def _read_parts(folder: Path) -> list[Published]:
+    """All sound parts in a dataset's folder, in order of their keys."""
+    keys = sorted(key for key in map(key_of_file, scan_dataset(folder).files) if key is not None)
+
+    def read(key: PartKey) -> Published | None:
+        try:
+            return read_published(folder / part_file(key), key.run)[0]
+        except (StoreError, ManifestError):
+            return None
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        return [part for part in pool.map(read, keys) if part is not None]
+
+
+def _draw_again(table: PartTable, manifest: Manifest) -> tuple[Task, ...]:
+    """The tasks of the parts and of the recipe's choice, as the recipe draws them."""
+    recipe = manifest.recipe
+    present = set(table.columns["task"].tolist())
+    if len(present) < manifest.tasks.lines:
+        present |= {task.index for task in choose_tasks(recipe)}
+    return tuple(task for task in draw_tasks(recipe.make_environment()) if task.index in present)
