@@ -17,7 +17,7 @@ import pytest
 from tcmrl_data import Dataset, Selection, clear_cache, list_cache, verify_cache
 from tcmrl_data.foundation import disk
 from tcmrl_data.foundation.disk import lock_file, lock_holder
-from tcmrl_data.foundation.errors import CacheError
+from tcmrl_data.foundation.errors import CacheError, LockedError
 from tcmrl_data.foundation.locks import try_exclusive_lock
 from tcmrl_data.sampling.cache import cached_rows
 from tcmrl_data.sampling.cache_entry import entry_bytes
@@ -179,6 +179,18 @@ def test_a_removed_lock_is_not_held(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(disk, "try_exclusive_lock", remove_once)
     with lock_file(tmp_path / "lock", "it") as lock:
         assert lock_holder(lock) is not None
+
+
+def test_a_lock_that_its_holder_removes_is_refused_once_more(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def remove_and_refuse(file: Any) -> bool:
+        (tmp_path / "lock").unlink()
+        return False
+
+    monkeypatch.setattr(disk, "try_exclusive_lock", remove_and_refuse)
+    with pytest.raises(LockedError, match="by another process"), lock_file(tmp_path / "lock", "it"):
+        pass
 
 
 def test_a_cache_that_may_only_be_read_is_read(selection: Selection, tiny_folder: Path, folder: Path) -> None:

@@ -224,7 +224,7 @@ def lock_file(path: Path, what: str) -> Iterator[Path]:
         with named_errors(path, remedy="choose a folder on a file system with locks"):
             is_ours = try_exclusive_lock(file)
         if not is_ours:
-            raise LockedError(f"{what} is being written by {_holder(path)}; wait for it or stop it")
+            raise LockedError(f"{what} is being written by {_holder(file)}; wait for it or stop it")
         if not is_current(file, path):  # its last holder removed it after it was opened here
             stack.close()
             stack.enter_context(lock_file(path, what))
@@ -263,13 +263,14 @@ def lock_holder(path: Path) -> str | None:
         return None
     try:
         with path.open("rb") as file:
-            return _holder(path) if is_locked(file) else None
+            return _holder(file) if is_locked(file) else None
     except FileNotFoundError:  # removed meanwhile
         return None
 
 
-def _holder(path: Path) -> str:
-    return path.read_text(errors="replace").strip()[:200] or "another process"
+def _holder(file: IO[Any]) -> str:
+    """The process that a lock file names; its path may name another file by now, or none."""
+    return os.pread(file.fileno(), 200, 0).decode(errors="replace").strip() or "another process"
 
 
 def remove_abandoned(root: Path) -> list[str]:
@@ -292,6 +293,6 @@ def remove_abandoned(root: Path) -> list[str]:
         if path.is_dir():
             remove_tree(path)
         else:
-            path.unlink()
+            path.unlink(missing_ok=True)  # its owner may have removed it meanwhile
         removed.append(path.name)
     return removed

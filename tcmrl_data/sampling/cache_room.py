@@ -80,11 +80,19 @@ def _look_at(entry: Path) -> CacheEntry:
         with (entry / RECORD).open("rb") as file:
             record, used, in_use = read_entry(file), os.fstat(file.fileno()).st_mtime, is_locked(file)
     about = (record.environment, record.dataset, record.tasks, record.parts) if record else ("", "", 0, 0)
-    return CacheEntry(entry.name, *about, _bytes_below(entry), used, in_use)
+    return CacheEntry(entry.name, *about, _bytes_in(entry), used, in_use)
 
 
-def _bytes_below(folder: Path) -> int:
-    return sum(path.stat().st_size for path in folder.iterdir())
+def _bytes_in(folder: Path) -> int:
+    return sum(status.st_size for status in _statuses(folder))
+
+
+def _statuses(folder: Path) -> Iterator[os.stat_result]:
+    """What the system says of a folder's files, while another process may be removing them."""
+    with contextlib.suppress(FileNotFoundError):
+        for path in list(folder.iterdir()):
+            with contextlib.suppress(FileNotFoundError):
+                yield path.stat()
 
 
 @contextlib.contextmanager
@@ -202,7 +210,7 @@ def _make_room(folder: Path, needed: int, limit: int) -> None:
     staged = [path for path in (folder / STAGING).iterdir() if path.is_dir()]
     found = entries(folder)
     idle = [entry for entry in found if not entry.in_use]
-    taken = sum(map(_bytes_below, staged)) + sum(entry.bytes for entry in found)
+    taken = sum(map(_bytes_in, staged)) + sum(entry.bytes for entry in found)
     kept = taken - sum(entry.bytes for entry in idle)
     while idle and kept + needed <= limit < taken + needed:
         entry = idle.pop(0)
@@ -226,8 +234,7 @@ def _make_room(folder: Path, needed: int, limit: int) -> None:
 
 def _unwritten(staged: Path) -> int:
     """Bytes that an entry being written will still take from the disk."""
-    sizes = (path.stat() for path in staged.iterdir())
-    return sum(max(0, status.st_size - 512 * status.st_blocks) for status in sizes)
+    return sum(max(0, status.st_size - 512 * status.st_blocks) for status in _statuses(staged))
 
 
 def _evict(folder: Path, key: str) -> bool:
