@@ -8,10 +8,12 @@ from typing import Any
 
 from tcmrl_data.build.events import BuildEvent, EventKind, EventLog
 from tcmrl_data.build.ledger import Ledger
+from tcmrl_data.build.nodes import check_nodes
 from tcmrl_data.build.published import Published
 from tcmrl_data.build.unit import UnitSpec
 from tcmrl_data.engine.base import BaseEngine, Result, Unit
 from tcmrl_data.envs.tasks import Task
+from tcmrl_data.foundation.shared_folder import VISIBLE_SECONDS
 from tcmrl_data.store.keys import PartKey, part_file
 
 WORKER = "tcmrl_data.build.worker"
@@ -29,6 +31,7 @@ class Driver:
     def __init__(self, ledger: Ledger, dataset: Path) -> None:
         self._ledger, self._plan, self._dataset = ledger, ledger.plan, dataset
         self._steps_done = self._steps_total = 0
+        self._deadline = 0.0
 
     def run(self, engine: BaseEngine, log: EventLog) -> tuple[str, ...]:
         """Runs the units; returns one line per failure.
@@ -40,12 +43,14 @@ class Driver:
         tasks_of = {_unit_id(group): group for group in groups}
         self._steps_total = self._plan.source.training_steps * sum(map(len, groups))
         failures: list[str] = []
+        remarks = [*check_nodes(engine, self._plan, self._dataset), *self._remarks()]
+        self._deadline = VISIBLE_SECONDS if engine.takes_address else 0.0
         try:
-            for remark in self._remarks():
-                log.write(self._event("warning", remark))
             ledger.begin()
             unfinished = len(self._plan.wanted) - ledger.num_tasks_done
             log.write(self._event("start", f"{unfinished} of {len(self._plan.wanted)} tasks to build"))
+            for remark in remarks:
+                log.write(self._event("warning", remark))
             results = engine.run(
                 [self._unit(group) for group in groups],
                 lambda unit, message: self._on_message(unit, message, log),
@@ -104,17 +109,17 @@ class Driver:
 
     def _checked(self, result: Result, tasks: Sequence[Task]) -> Result:
         """A unit's result, failed where parts are still missing."""
-        self._take_in_unreported(tasks)
+        self._take_in_unreported(tasks, deadline=self._deadline if result.ok else 0.0)
         missing = self._missing(tasks)
         if result.ok and missing:
             problem = f"it ended without {len(missing)} of its parts, the first is {part_file(missing[0])}"
             return dataclasses.replace(result, ok=False, error=problem)
         return result
 
-    def _take_in_unreported(self, tasks: Sequence[Task]) -> None:
+    def _take_in_unreported(self, tasks: Sequence[Task], *, deadline: float = 0.0) -> None:
         """Takes in parts whose messages were lost, with the worker that published them."""
         for task in tasks:
-            self._ledger.take_in_unreported(task.index)
+            self._ledger.take_in_unreported(task.index, deadline=deadline)
 
     def _on_message(self, unit: str, message: Mapping[str, Any], log: EventLog) -> None:
         if message["kind"] == "steps":
@@ -125,7 +130,7 @@ class Driver:
             log.write(self._event("warning", f"{unit}: {message['message']}", unit))
             return
         published = Published.from_message(message)
-        if self._ledger.take_in(published):
+        if self._ledger.take_in(published, deadline=self._deadline):
             log.write(self._event("part", f"{unit}, step {published.entry.step}", unit))
 
     def _event(self, kind: EventKind, message: str, unit: str | None = None) -> BuildEvent:

@@ -13,6 +13,7 @@ from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError, TcmrlError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem
+from tcmrl_data.foundation.shared_folder import wait_until_visible
 from tcmrl_data.recipe.recipe import full_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_file, part_folder
@@ -114,11 +115,15 @@ class Ledger:
             self._record(published)
         self.seal()
 
-    def take_in(self, published: Published) -> bool:
+    def take_in(self, published: Published, *, deadline: float = 0.0) -> bool:
         """Adds a part that a worker has published; returns False if it is there already.
 
         Its content is not read again: the worker hashed what it wrote. The file has to be there, of the size
         that the worker wrote, with a valid directory.
+
+        Args:
+            published: the part.
+            deadline: seconds to wait at most for a file that another machine has published.
 
         Raises:
             StoreError: the file is not what the worker wrote.
@@ -126,6 +131,7 @@ class Ledger:
         key = published.entry.key
         if key.step in self._steps[key.task]:
             return False
+        wait_until_visible(self._out / part_file(key), deadline=deadline)
         with Archive(self._out / part_file(key)) as archive:
             if archive.size != published.entry.size:
                 raise StoreError(
@@ -138,11 +144,15 @@ class Ledger:
             self.seal()
         return True
 
-    def take_in_unreported(self, task: int) -> None:
-        """Adds the parts of a task whose reports were lost; damaged ones count as missing."""
+    def take_in_unreported(self, task: int, *, deadline: float = 0.0) -> None:
+        """Adds the parts of a task whose reports were lost; damaged ones count as missing.
+
+        Args:
+            task: index of the task.
+            deadline: seconds to wait at most for a file that another machine may have published.
+        """
         for key in self.missing(task):
-            file = self._out / part_file(key)
-            if file.exists():
+            if wait_until_visible(self._out / part_file(key), deadline=deadline):
                 published = self._read(key)
                 if published is not None:
                     self._add(key)
