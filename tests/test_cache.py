@@ -26,16 +26,20 @@ from tcmrl_data import (
     open_sampler,
     parse_bytes,
 )
-from tcmrl_data.foundation.canonical import canonical_json, sha256
-from tcmrl_data.foundation.errors import CacheError, StoreError
+from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
+from tcmrl_data.foundation.errors import CacheError, ManifestError, StoreError
 from tcmrl_data.sampling import cache, cache_entry
 from tcmrl_data.sampling.cache import cached_rows, load_rows
 from tcmrl_data.sampling.cache_entry import RECORD_BYTES
 from tcmrl_data.sampling.cache_table import TableSeal, write_table
 from tcmrl_data.sampling.rows import Indices, PartRows, Table, read_rows
+from tcmrl_data.store.archive import pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays
+from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.manifest import MANIFEST, seal
+from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, parse_parts, part_line
+from tcmrl_data.store.tables import seal_of
 from tests.commands import Call, in_process
-from tests.hostile_corpus import STEP, Forge, base
 
 REQUEST = BatchRequest(
     tasks=16, kinds={"policy": Transitions(20), "context": Trajectories(1), "windows": Windows(5, length=3)}
@@ -94,26 +98,53 @@ def test_every_selection_has_an_entry_that_equal_parts_share(
     assert len(entries(folder)) == 2
 
 
-@pytest.mark.parametrize("claim", ["part", "root"])
+@pytest.mark.parametrize("claim", ["part", "root", "nothing"])
 def test_a_forged_copy_never_takes_the_place_of_the_honest_dataset(
-    tiny: Dataset, tmp_path: Path, claim: str
+    tiny: Dataset, tiny_copy: Callable[[], Path], claim: str
 ) -> None:
-    """A copy with other rewards that claims the id of the honest part, or the root of the honest dataset."""
-    honest = open_dataset(base(tiny.folder, tmp_path / "honest"))
-    forge = Forge(base(tiny.folder, tmp_path / "forged"), tmp_path)
-    rewards = honest.arrays(0, STEP)["rewards"] + 1
-    forge.write("rewards/c/0", encode_arrays({"rewards": rewards})["rewards/c/0"])
-    if claim == "root":
-        found = array_digests({"rewards": rewards})["rewards"]
-        forge.record(lambda values: values["identity"]["arrays"]["rewards"].update(found))
-    forged = open_dataset(forge.folder)
-    forged = Dataset(forged.folder, forged.manifest.model_copy(update={"root": honest.manifest.root}))
+    """A copy with other rewards that claims the honest part's id, or the honest root, or to be new data."""
+    forged = open_dataset(forge(tiny_copy(), claim=claim)).select
     if claim == "part":
-        with pytest.raises(StoreError, match=r"forged.*rewards is not the array that part.json records"):
-            cached_rows(forged.select())
+        with pytest.raises(StoreError, match=r"0000150.zip: rewards is not the array that part.json records"):
+            cached_rows(forged(tasks=[0]))
+    elif claim == "root":
+        with pytest.raises(ManifestError, match="do not have the manifest's root"):
+            cached_rows(forged(tasks=[0]))
     else:
-        cached_rows(forged.select())
-    np.testing.assert_array_equal(cached_rows(honest.select()).table, read_rows(honest.select()).table)
+        cached_rows(forged(tasks=[0]))
+    honest = tiny.select(tasks=[0])
+    np.testing.assert_array_equal(cached_rows(honest).table, read_rows(honest).table)
+
+
+def forge(copy: Path, *, claim: str) -> Path:
+    """Adds 1 to every reward of a part of a dataset; all digests agree but that of the claim."""
+    dataset = open_dataset(copy)
+    key = dataset.parts.keys_of(0)[-1]
+    with dataset.open_part(key) as archive:
+        members = {name: archive.read(name) for name in archive.names}
+    rewards = {"rewards": dataset.arrays(*key)["rewards"] + 1}
+    members |= {name: data for name, data in encode_arrays(rewards).items() if name.endswith("rewards/c/0")}
+    record = json.loads(members["part.json"])
+    if claim != "part":
+        record["identity"]["arrays"] |= array_digests(rewards)
+        record["id"] = digest(record["identity"])
+    members["part.json"] = canonical_json(record)
+    data = pack_archive(members)
+    dataset.file_of(key).write_bytes(data)
+    changed = {"id": record["id"], "sha256": sha256(data), "size": len(data)}
+    entries = [
+        entry._replace(**changed) if (entry.task, entry.step) == key[:2] else entry
+        for entry in dataset.parts.entries()
+    ]
+    lines = HEADER + b"".join(map(part_line, entries))
+    (copy / PARTS_TABLE).write_bytes(lines)
+    values = json.loads((copy / MANIFEST).read_bytes())
+    values["parts"] = seal_of(lines).model_dump()
+    values["totals"]["bytes"] = sum(entry.size for entry in entries)
+    values["root"] = values["root"] if claim == "root" else parse_parts(lines, copy).root
+    values.pop("digest")
+    (copy / MANIFEST).write_bytes(seal(values))
+    return copy
 
 
 @pytest.mark.parametrize(
@@ -221,18 +252,18 @@ def test_a_disk_without_room_is_refused(selection: Selection, monkeypatch: pytes
 
 def test_a_damaged_part_leaves_no_entry(tiny_copy: Callable[[], Path], folder: Path) -> None:
     dataset = open_dataset(tiny_copy())
-    chunk = next(dataset.folder.glob("tasks/*/snapshots/*/rewards/c/0"))
-    content = bytearray(chunk.read_bytes())
-    content[-6] ^= 1
-    chunk.write_bytes(bytes(content))
-    with pytest.raises(StoreError, match=r"rewards/c/0 does not decode.*repair"):
+    part = dataset.file_of(dataset.parts.keys_of(0)[0])
+    with dataset.open_part(dataset.parts.keys_of(0)[0]) as archive:
+        chunk = archive.read("arrays/rewards/c/0")
+    part.write_bytes(part.read_bytes().replace(chunk, chunk[:-6] + bytes([chunk[-6] ^ 1]) + chunk[-5:]))
+    with pytest.raises(StoreError, match=r"rewards/c/0.*repair"):
         cached_rows(dataset.select())
     assert not (folder / "rows").exists() or not entries(folder)
     assert not [path for path in (folder / ".staging").iterdir() if path.suffix != ".lock"]
 
 
 def test_decoding_takes_the_memory_of_the_parts_at_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A table of 40 parts of 1 MB, decoded by one reader."""
 
@@ -243,7 +274,7 @@ def test_decoding_takes_the_memory_of_the_parts_at_work(
     monkeypatch.setattr("tcmrl_data.sampling.rows.READERS", 1)
     monkeypatch.setattr("tcmrl_data.sampling.cache_table.read_part", fill)
     rows = 2**18 // 8
-    plan = [PartRows(tmp_path, 0, rows * i, rows * (i + 1), {}) for i in range(40)]
+    plan = [PartRows(tiny, PartKey(0, i), 0, rows * i, rows * (i + 1), 1) for i in range(40)]
     (tmp_path / "rows").touch()
     tracemalloc.start()
     write_table(tmp_path / "rows", plan, (40 * rows, 8))
