@@ -1,6 +1,6 @@
 import json
 import os
-import subprocess
+import shutil
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 from typing import final
@@ -21,7 +21,8 @@ from tcmrl_data import (
     roll_out,
 )
 from tcmrl_data.build.driver import Driver
-from tcmrl_data.build.events import EventLog
+from tcmrl_data.build.events import BuildEvent, EventLog
+from tcmrl_data.build.ledger import Ledger
 from tcmrl_data.build.plan import plan_build
 from tcmrl_data.build.unit import UnitSpec, run_unit
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
@@ -31,14 +32,23 @@ from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 from tcmrl_data.foundation.disk import LOCK, lock_file
 from tcmrl_data.foundation.errors import BuildError, LockedError, ManifestError, StoreError
 from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
+from tcmrl_data.store.part_table import PARTS_TABLE
+from tcmrl_data.store.task_table import TASKS as TASKS_TABLE
 from tests.conftest import TASKS, TINY
 
 Copy = Callable[[], Path]
 
 
-def ids(folder: Path) -> dict[tuple[int, int], str]:
-    return {(part.task, part.step): part.id for part in read_manifest(folder).parts}
+def forget(folder: Path) -> None:
+    """Leaves the parts of a dataset and nothing that names them."""
+    for name in (MANIFEST, TASKS_TABLE, PARTS_TABLE):
+        (folder / name).unlink()
+
+
+def ids(folder: Path) -> dict[PartKey, str]:
+    return {entry.key: entry.id for entry in open_dataset(folder).recorded_parts.entries()}
 
 
 def test_ids_do_not_depend_on_workers_halves_or_training_defaults(tiny_folder: Path, tmp_path: Path) -> None:
@@ -55,7 +65,7 @@ def test_another_seed_has_other_data_for_the_same_tasks(
 ) -> None:
     tcmrl_data.build_dataset(tiny_recipe, tmp_path / "other", seed=1, tasks=[0, 3], workers=2)
     other = open_dataset(tmp_path / "other")
-    assert not {part.id for part in other.manifest.parts} & {part.id for part in tiny.manifest.parts}
+    assert not {*ids(other.folder).values()} & {*ids(tiny.folder).values()}
     assert [other.task(index) for index in (0, 3)] == [tiny.task(index) for index in (0, 3)]
 
 
@@ -76,11 +86,73 @@ def test_a_second_build_does_only_what_is_missing(
     tiny_copy: Copy, tiny_recipe: Recipe, tiny_folder: Path
 ) -> None:
     folder = tiny_copy()
-    lost = open_dataset(folder).folder_of(40, 150)
-    subprocess.run(["rm", "-r", str(lost)], check=True)
+    forget(folder)
+    (folder / part_file(PartKey(40, 150))).unlink()
     report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS, workers=1)
     assert (report.built, report.present) == (1, 14)
     assert ids(folder) == ids(tiny_folder)
+    assert read_manifest(folder).root == read_manifest(tiny_folder).root
+
+
+@pytest.mark.parametrize("problem", ["is missing", "has 7 bytes instead of"])
+def test_a_recorded_part_that_is_gone_or_cut_is_left_to_repair(
+    tiny_copy: Copy, tiny_recipe: Recipe, tiny_folder: Path, problem: str
+) -> None:
+    folder = tiny_copy()
+    file = folder / part_file(PartKey(40, 150))
+    file.unlink()
+    if problem != "is missing":
+        file.write_bytes(b"PK\x03\x04...")
+    with pytest.raises(StoreError, match=f"{file} {problem}.*; run `tcmrl-data repair {folder}`"):
+        tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+    assert tcmrl_data.repair_dataset(folder, workers=1).repaired == (PartKey(40, 150),)
+    assert tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS).present == 15
+    assert file.read_bytes() == (tiny_folder / part_file(PartKey(40, 150))).read_bytes()
+
+
+DAMAGES: dict[str, Callable[[bytes], bytes]] = {
+    "a byte of an array": lambda data: data[:2_000] + bytes([data[2_000] ^ 1]) + data[2_001:],
+    "the last byte": lambda data: data[:-1] + bytes([data[-1] ^ 1]),
+    "the second half": lambda data: data[: len(data) // 2],
+    "everything": lambda data: b"",
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_a_part_damaged_before_it_was_recorded_is_made_again_and_named(
+    tiny_copy: Copy, tiny_recipe: Recipe, tiny_folder: Path, damage: str
+) -> None:
+    folder = tiny_copy()
+    forget(folder)
+    file = folder / part_file(PartKey(3, 100))
+    file.write_bytes(DAMAGES[damage](file.read_bytes()))
+    events: list[BuildEvent] = []
+    report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS, workers=1, progress=events.append)
+    assert (report.built, report.present, report.failed) == (1, 14, ())
+    (warning,) = [event.message for event in events if event.kind == "warning"]
+    assert warning == f"{file} was damaged before it was recorded; it is made again"
+    assert file.read_bytes() == (tiny_folder / part_file(PartKey(3, 100))).read_bytes()
+    assert tcmrl_data.verify_dataset(folder).findings == ()
+
+
+def test_a_sound_part_of_another_seed_or_recipe_or_task_is_refused_by_name(
+    tiny_copy: Copy, tiny_recipe: Recipe, tiny_folder: Path, tmp_path: Path
+) -> None:
+    """Such a part was put there by hand: deleting it is left to the user."""
+    folder = tiny_copy()
+    forget(folder)
+    other = load_recipe("point-robot", profile="quick", overrides=[*TINY, "rollouts.episodes=3"])
+    with pytest.raises(StoreError, match=r"0000000.zip: was built with other settings; delete it"):
+        tcmrl_data.build_dataset(other, folder, tasks=TASKS)
+    with pytest.raises(StoreError, match=r"0000000.zip: holds another part; delete it"):
+        tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS, seed=1)
+    file = folder / part_file(PartKey(3, 100))
+    shutil.copyfile(tiny_folder / part_file(PartKey(0, 100)), file)
+    with pytest.raises(StoreError, match=f"{file}: holds another part; delete it"):
+        tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+    assert not (folder / MANIFEST).exists()
+    file.unlink()
+    assert tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS, workers=1).built == 1
 
 
 def test_another_recipe_or_seed_is_refused(tiny_copy: Copy, tiny_recipe: Recipe) -> None:
@@ -105,41 +177,46 @@ def test_two_builders_at_once_one_is_refused_by_name(tiny_copy: Copy, tiny_recip
         tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
 
 
-@pytest.mark.parametrize("name", ["rewards/c/0", "policy.safetensors", "observations/zarr.json"])
-def test_a_flipped_bit_stops_the_build_and_names_the_file(
+@pytest.mark.parametrize("name", [TASKS_TABLE, PARTS_TABLE])
+def test_a_flipped_bit_of_a_table_stops_the_build_and_names_the_file(
     tiny_copy: Copy, tiny_recipe: Recipe, name: str
 ) -> None:
-    folder = tiny_copy()
-    file = folder / "tasks/00003/snapshots/step_0000100" / name
+    file = tiny_copy() / name
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
-    with pytest.raises((StoreError, ManifestError), match=str(file)):
-        tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+    with pytest.raises(ManifestError, match=f"{file}: its first .*; run `tcmrl-data repair`"):
+        tcmrl_data.build_dataset(tiny_recipe, file.parent, tasks=TASKS)
 
 
 def test_a_failing_unit_is_reported_and_the_others_are_done(tmp_path: Path, tiny_recipe: Recipe) -> None:
-    """A file in the place of one task's part makes that unit fail for good."""
+    """A folder that comes into the place of one task's part makes that unit fail for good."""
     out = tmp_path / "poisoned"
-    blocked = out / "tasks/00003/snapshots"
-    blocked.mkdir(parents=True)
-    (blocked / "step_0000100").write_text("in the way")
-    report = tcmrl_data.build_dataset(tiny_recipe, out, tasks=[0, 3], workers=2)
+    blocked = out / part_file(PartKey(3, 100))
+
+    def block(event: BuildEvent) -> None:
+        (blocked / "in the way").mkdir(parents=True, exist_ok=True)
+
+    report = tcmrl_data.build_dataset(tiny_recipe, out, tasks=[0, 3], workers=2, progress=block)
     assert [failure.split(" failed")[0] for failure in report.failed] == ["task 3"]
     assert not read_manifest(out).complete
-    assert set(ids(out)) == {(0, 0), (0, 100), (0, 150), (3, 0)}
+    assert set(ids(out)) == {PartKey(0, 0), PartKey(0, 100), PartKey(0, 150), PartKey(3, 0)}
+    with pytest.raises(StoreError, match=f"{blocked} is a folder, not a plain file; delete it"):
+        tcmrl_data.build_dataset(tiny_recipe, out, tasks=[0, 3])
 
 
-def test_the_manifest_is_its_canonical_form(tiny_folder: Path) -> None:
-    data = (tiny_folder / MANIFEST).read_bytes()
-    values = json.loads(data)
-    assert tcmrl_data.canonical_json(values) == data
-    assert values["tasks"][1] == {
+def test_the_manifest_and_the_tables_are_canonical(tiny_folder: Path) -> None:
+    for name in (MANIFEST, TASKS_TABLE, PARTS_TABLE):
+        lines = (tiny_folder / name).read_bytes().splitlines(keepends=True)
+        assert [tcmrl_data.canonical_json(json.loads(line)) for line in lines] == lines
+    assert json.loads((tiny_folder / TASKS_TABLE).read_bytes().splitlines()[1]) == {
         "index": 3,
         "split": "test",
         "parameters": {"goal": [0.9954719226, 0.0950560433], "wind": [0.0, 0.0]},
     }
-    assert values["references"]["3"]["oracle"] > values["references"]["3"]["uniform"]
+    manifest = read_manifest(tiny_folder)
+    assert (manifest.tasks.lines, manifest.parts.lines, manifest.totals.parts) == (5, 16, 15)
+    assert manifest.totals.bytes == sum(file.stat().st_size for file in tiny_folder.rglob("*.zip"))
 
 
 def test_a_foreign_file_does_not_stop_a_build_and_is_verifys_to_name(
@@ -170,11 +247,11 @@ class HastyEngine(BaseEngine):
 
 
 def test_a_unit_that_is_done_without_its_parts_failed(tiny_recipe: Recipe, tmp_path: Path) -> None:
-    driver = Driver(plan_build(tiny_recipe, tasks=[3]), tmp_path)
+    driver = Driver(Ledger(plan_build(tiny_recipe, tasks=[3]), tmp_path), tmp_path)
     with EventLog(tmp_path, lambda event: None) as log:
         (failure,) = driver.run(HastyEngine(), log)
     assert "task 3 failed" in failure
-    assert "ended without 3 of its parts, the first is tasks/00003/snapshots/step_0000000" in failure
+    assert "ended without 3 of its parts, the first is parts/main/00003/0000000.zip" in failure
     assert not read_manifest(tmp_path).complete
 
 

@@ -36,7 +36,7 @@ class Driver:
     def run(self, engine: BaseEngine, log: EventLog) -> tuple[str, ...]:
         """Runs the units; returns one line per failure.
 
-        However it ends, the manifest then names every part that was taken in.
+        However the units end, the manifest then names every part that was taken in.
         """
         ledger = self._ledger
         groups = [group for group in self._plan.groups if self._missing(group)]
@@ -45,8 +45,8 @@ class Driver:
         failures: list[str] = []
         remarks = [*check_nodes(engine, self._plan, self._dataset), *self._remarks()]
         self._deadline = VISIBLE_SECONDS if engine.takes_address else 0.0
+        ledger.begin()
         try:
-            ledger.begin()
             unfinished = len(self._plan.wanted) - ledger.num_tasks_done
             log.write(self._event("start", f"{unfinished} of {len(self._plan.wanted)} tasks to build"))
             for remark in remarks:

@@ -2,19 +2,18 @@
 
 import os
 import time
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
 
 from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.published import Published, read_published
-from tcmrl_data.foundation.disk import STAGING, replace_file
-from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError, TcmrlError
+from tcmrl_data.foundation.disk import STAGING, named_errors, replace_file
+from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem
 from tcmrl_data.foundation.shared_folder import wait_until_visible
-from tcmrl_data.recipe.recipe import full_settings
+from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_file, part_folder
 from tcmrl_data.store.limits import MAX_PLATFORMS
@@ -105,10 +104,11 @@ class Ledger:
             StorageError: the operating system refuses an operation.
         """
         for file in self.damaged:
-            file.unlink()
+            with named_errors(file):
+                file.unlink()
         self._task_writer.append(b"".join(map(task_line, self._new_tasks)))
         self._new_tasks = []
-        if self._earlier is None:
+        if not self._part_writer.seal.lines:
             self._part_writer.append(HEADER)
         found, self._found = self._found, []
         for published in found:
@@ -137,8 +137,8 @@ class Ledger:
                 raise StoreError(
                     f"{archive.path} has {archive.size} bytes, its worker wrote {published.entry.size}"
                 )
-        self._add(key)
         self._record(published)
+        self._add(key)
         wait = max(SEAL_SECONDS, self._seal_seconds / SEAL_SHARE)
         if time.monotonic() - self._sealed > wait:
             self.seal()
@@ -155,40 +155,41 @@ class Ledger:
             if wait_until_visible(self._out / part_file(key), deadline=deadline):
                 published = self._read(key)
                 if published is not None:
-                    self._add(key)
                     self._record(published)
+                    self._add(key)
 
     def is_sealed(self) -> bool:
         """Whether the manifest on disk says all that is known here."""
         nothing_new = not (self._new_tasks or self._new or self._found or self.damaged)
-        return nothing_new and self._is_written(self._manifest())
+        return nothing_new and self._is_written(self._manifest()) and not self._has_more()
 
     def seal(self) -> None:
-        """Writes the manifest, unless it stands there already.
+        """Writes the manifest and cuts off what stands behind the tables, unless this is so already.
+
+        After Ctrl-C between the line of a part and its entry here, the old manifest stays: the next build
+        takes the line from the log.
 
         Raises:
             StorageError: the operating system refuses an operation; the old manifest is unchanged.
         """
         began = time.monotonic()
         self._table, self._new = self._table.with_entries(self._new), []
+        if self._part_writer.seal.lines != 1 + len(self._table):
+            return
         data = self._manifest()
-        if not self._is_written(data):
+        if not self._is_written(data) or self._has_more():
             self._task_writer.sync()
             self._part_writer.sync()
             replace_file(self._out / MANIFEST, data, staging=self._out / STAGING)
         self._sealed = time.monotonic()
         self._seal_seconds = self._sealed - began
 
-    def _is_of_recipe(self, recorded: Mapping[str, Any]) -> bool:
-        """Whether recorded settings are the plan's, with defaults where they lack a field."""
-        try:
-            return full_settings(recorded) == full_settings(self.plan.recipe.unit_settings())
-        except TcmrlError:
-            return False
-
     def _is_written(self, data: bytes) -> bool:
         file = self._out / MANIFEST
         return file.is_file() and file.read_bytes() == data
+
+    def _has_more(self) -> bool:
+        return self._task_writer.has_more or self._part_writer.has_more
 
     def _kept_parts(self) -> PartTable:
         """The parts of the tasks that were not dropped."""
@@ -218,7 +219,7 @@ class Ledger:
             "dropped": sorted(plan.dropped),
             "totals": totals.model_dump(),
             "root": table.root,
-            "complete": not self.num_missing,
+            "complete": len(table) == len(self._steps) * len(plan.source.steps),
         }
         return seal(fields)
 
@@ -311,6 +312,8 @@ class Ledger:
         identity = record.identity
         if (identity.task, identity.step, identity.seed) != (key.task, key.step, self.plan.seed):
             raise StoreError(f"{file}: holds another part; delete it")
-        if identity.data_version != DATA_VERSION or not self._is_of_recipe(identity.settings):
+        if identity.data_version != DATA_VERSION or not same_settings(
+            identity.settings, self.plan.recipe.unit_settings()
+        ):
             raise StoreError(f"{file}: was built with other settings; delete it")
         return published

@@ -39,6 +39,10 @@ class Disk:
             file.seek(offset)
             file.write(data)
 
+    def truncate(self, path: Path, size: int) -> None:
+        """Cuts off what a file holds behind its first `size` bytes, without forcing it to disk."""
+        os.truncate(path, size)
+
     def sync(self, path: Path) -> None:
         """Forces a file's content, or a folder's entries, to disk."""
         descriptor = os.open(path, os.O_RDONLY)

@@ -11,7 +11,7 @@ from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorSource
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment, Reward, make_environment
 from tcmrl_data.envs.controller import View
 from tcmrl_data.foundation.canonical import canonical_json
-from tcmrl_data.foundation.errors import RecipeError
+from tcmrl_data.foundation.errors import RecipeError, TcmrlError
 from tcmrl_data.foundation.validation import validate_table
 from tcmrl_data.recipe.document import merge_tables, open_recipe, read_override
 from tcmrl_data.recipe.profile import Profile
@@ -204,6 +204,19 @@ def full_settings(recorded: Mapping[str, Any]) -> dict[str, Any]:
         "environment": environment.model_dump(mode="json"),
         "behavior": source.model_dump(mode="json") | {"settings": settings.model_dump(mode="json")},
     }
+
+
+def same_settings(recorded: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
+    """Whether two recorded unit settings are equal, with defaults where they lack a field.
+
+    Settings that this version cannot read are equal only if they are written alike.
+    """
+    if recorded == other:
+        return True
+    try:
+        return full_settings(recorded) == full_settings(other)
+    except TcmrlError:
+        return False
 
 
 def _check_overrides(overrides: Sequence[str]) -> None:

@@ -175,7 +175,7 @@ class Manifest(Record):
             raise ValueError("recipe.environment.name is not the manifest's name")
         if list(self.dropped) != sorted(set(self.dropped)):
             raise ValueError("dropped must be sorted, each once")
-        if self.num_tasks < 0 or self.tasks.lines > MAX_TASKS or self.parts.lines > MAX_PARTS:
+        if self.num_tasks < 0 or self.tasks.lines > MAX_TASKS or self.parts.lines > 1 + MAX_PARTS:
             raise ValueError(f"a dataset has at most {MAX_TASKS} tasks and {MAX_PARTS} parts")
         return self
 

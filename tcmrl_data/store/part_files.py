@@ -1,11 +1,12 @@
 """Whether a part's archive holds the files that its record calls for, in their allowed form."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from math import prod
 from typing import Any
 
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.layout import ARRAYS, ArrayLayout, check_expansion, check_layout
 from tcmrl_data.store.manifest import Run
@@ -46,7 +47,13 @@ def _odd_member(archive: Archive, layouts: Sequence[ArrayLayout]) -> str | None:
 
 
 def identity_problems(
-    record: PartRecord, *, entry: PartEntry, task: Task, run: Run, settings: Any, data_version: int
+    record: PartRecord,
+    *,
+    entry: PartEntry,
+    task: Task,
+    run: Run,
+    settings: Mapping[str, Any] | None,
+    data_version: int,
 ) -> Iterator[str]:
     """How a part's record differs from what the dataset says of it.
 
@@ -55,7 +62,7 @@ def identity_problems(
         entry: the part in the table.
         task: its task.
         run: its run.
-        settings: of the run's recipe, in full form; None where the run was not built.
+        settings: of the run's recipe; None where the run was not built.
         data_version: of the dataset.
     """
     identity = record.identity
@@ -66,10 +73,11 @@ def identity_problems(
         ("identity.data_version", identity.data_version, data_version),
         ("identity.parameters", identity.parameters, task.parameters),
         ("identity.seed", identity.seed, identity.seed if run.seed is None else run.seed),
-        ("identity.settings", identity.settings, identity.settings if settings is None else settings),
     ):
         if found != wanted:
             yield f"{name} is not the manifest's"
+    if settings is not None and not same_settings(identity.settings, settings):
+        yield "identity.settings is not the manifest's"
     for name in STATISTICS:
         if getattr(record.statistics, name) != getattr(entry, name):
             yield f"statistics.{name} is not that of parts.jsonl"

@@ -6,7 +6,6 @@ them again. Readers read the sealed lines only.
 """
 
 import hashlib
-import os
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -86,8 +85,7 @@ class TableWriter:
 
     def __init__(self, file: Path, lines: bytes = b"") -> None:
         self._file = file
-        self._hash = hashlib.sha256(lines)
-        self._lines, self._bytes = lines.count(b"\n"), len(lines)
+        self._state = (hashlib.sha256(lines), seal_of(lines))
 
     def append(self, lines: bytes) -> None:
         """Writes complete lines behind the others; not forced to disk before they are sealed.
@@ -96,10 +94,16 @@ class TableWriter:
             StorageError: the operating system refuses the operation; the lines do not count then.
         """
         if lines:
+            hashed, seal = self._state[0].copy(), self._state[1]
             with named_errors(self._file):
-                disk.write_at(self._file, self._bytes, lines)
-            self._hash.update(lines)
-            self._lines, self._bytes = self._lines + lines.count(b"\n"), self._bytes + len(lines)
+                disk.write_at(self._file, seal.bytes, lines)
+            hashed.update(lines)
+            seal = TableSeal(
+                lines=seal.lines + lines.count(b"\n"),
+                bytes=seal.bytes + len(lines),
+                sha256=hashed.hexdigest(),
+            )
+            self._state = (hashed, seal)  # one step, so that an interruption leaves the two in agreement
 
     def sync(self) -> None:
         """Forces the lines to disk, and cuts off what stands behind them.
@@ -108,11 +112,16 @@ class TableWriter:
             StorageError: the operating system refuses the operation.
         """
         with named_errors(self._file):
-            if self._file.stat().st_size > self._bytes:
-                os.truncate(self._file, self._bytes)
+            if self.has_more:
+                disk.truncate(self._file, self.seal.bytes)
             disk.sync(self._file)
 
     @property
     def seal(self) -> TableSeal:
         """The seal of the lines; to be published after `sync`."""
-        return TableSeal(lines=self._lines, bytes=self._bytes, sha256=self._hash.hexdigest())
+        return self._state[1]
+
+    @property
+    def has_more(self) -> bool:
+        """Whether the file holds more than the lines."""
+        return self._file.stat().st_size > self.seal.bytes

@@ -15,6 +15,7 @@ from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
     lock_file,
+    make_folders,
     move_into_place,
     remove_abandoned,
     remove_tree,
@@ -174,6 +175,7 @@ def _make_again(
     others = [
         task.index for task in recorded if task.index // group_size in groups and task.index not in tasks
     ]
+    make_folders(target)
     for task in sorted(tasks):
         for key in dataset.recorded_parts.keys_of(task):
             if key.run == run.name and key not in keys:

@@ -50,7 +50,10 @@ def scan_dataset(folder: Path) -> Scan:
             scan.empty_folders.add(place)
         for entry in entries:
             path = f"{place}/{entry.name}" if place else entry.name
-            status = entry.stat(follow_symlinks=False)
+            try:
+                status = entry.stat(follow_symlinks=False)
+            except FileNotFoundError:  # a build has renamed or removed it meanwhile
+                continue
             is_folder = stat.S_ISDIR(status.st_mode)
             if is_folder and path.count("/") >= MAX_DEPTH:
                 scan.problems[path] = "lies deeper than any folder of a dataset"

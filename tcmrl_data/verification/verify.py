@@ -106,7 +106,7 @@ def verify_dataset(
     folder = dataset_folder(path)
     if not folder.is_dir() or not any((folder / name).exists() for name in (MANIFEST, PARTS)):
         raise ManifestError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
-    run = _Verification(folder, level, is_written=lock_holder(folder / LOCK) is not None)
+    run = _Verification(folder, level, is_locked=False)
     parts = run.check(progress)
     replays = run.replay(replay)
     sizes = [status.st_size for status in run.scan.files.values()]
@@ -124,7 +124,7 @@ def verify_dataset(
 
 def find_problems(folder: Path, level: VerifyLevel) -> tuple[Finding, ...]:
     """What `verify_dataset` finds; for a caller that holds the dataset's lock."""
-    run = _Verification(folder, level, is_written=False)
+    run = _Verification(folder, level, is_locked=True)
     run.check(lambda done, total: None)
     return tuple(sorted(set(run.findings), key=lambda finding: (finding.file, finding.problem)))
 
@@ -134,19 +134,22 @@ class _Verification:
     """One run over a dataset.
 
     Attributes:
-        is_written: another process writes to the dataset.
+        is_locked: this process holds the dataset's lock.
+        is_written: another process writes to the dataset, or has done so meanwhile.
         manifest: None where it cannot be read; tables that cannot be read are empty.
     """
 
     folder: Path
     level: VerifyLevel
-    is_written: bool
+    is_locked: bool
     findings: list[Finding] = field(default_factory=list)
 
     def __post_init__(self) -> None:
+        began_beside_a_build = self._has_writer()
         self.manifest = self._read_manifest()
         self.tasks, self.table = self._read_tables()
         self.scan: Scan = scan_dataset(self.folder)
+        self.is_written = began_beside_a_build or self._has_writer() or self._was_written()
         self._tasks_by_index = {task.index: task for task in self.tasks}
         self._runs = {run.name: run for run in self.manifest.runs} if self.manifest else {}
         self._settings = {
@@ -160,9 +163,8 @@ class _Verification:
         if self.manifest is None or self._is_damaged(PARTS_TABLE):
             entries = dict.fromkeys(unnamed)
         elif not self.is_written:
-            text = "is a part that the manifest does not name; `tcmrl-data build` takes it in if it holds"
             for file in unnamed:
-                self._add(file, text, foreign=True)
+                self._add(file, self._unnamed(file), foreign=True)
         with ThreadPoolExecutor(available_cores()) as pool:
             checked = pool.map(self._check_part, entries, entries.values())
             for done, findings in enumerate(checked):
@@ -189,6 +191,16 @@ class _Verification:
             for problem in replay.problems:
                 self._add(part_file(key), f"replay: {problem}")
         return tuple(replays)
+
+    def _has_writer(self) -> bool:
+        return not self.is_locked and lock_holder(self.folder / LOCK) is not None
+
+    def _was_written(self) -> bool:
+        """Whether the manifest is another one than that which was read."""
+        try:
+            return self.manifest is not None and read_manifest(self.folder).digest != self.manifest.digest
+        except ManifestError:
+            return False
 
     def _read_manifest(self) -> Manifest | None:
         try:
@@ -232,6 +244,16 @@ class _Verification:
         for name, value in expected.items():
             if found[name] != value:
                 self._add(MANIFEST, f"{name} does not agree with {PARTS_TABLE}")
+
+    def _unnamed(self, file: str) -> str:
+        """What to say of a part that no table names."""
+        key = key_of_file(file)
+        if self.manifest and key and key.task in self.manifest.dropped:
+            return (
+                "is a part of a dropped task that the manifest does not name; delete it, or build with "
+                f"--tasks {key.task}"
+            )
+        return "is a part that the manifest does not name; `tcmrl-data build` takes it in if it holds"
 
     def _check_part(self, file: str, entry: PartEntry | None) -> list[Finding]:
         """The findings of one part; `entry` is None where the table cannot tell."""
