@@ -6,15 +6,17 @@ import numpy as np
 
 import tcmrl_data
 from tcmrl_data.behavior.snapshot import ScriptedDescription, Snapshot
-from tcmrl_data.build.driver import Driver, make_groups
+from tcmrl_data.build.ledger import Ledger
 from tcmrl_data.build.part import seal_part
 from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.build.published import Published
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
-from tcmrl_data.foundation.disk import publish_folder
+from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.recipe.tasks import choose_tasks
-from tcmrl_data.store.manifest import References, part_folder
+from tcmrl_data.store.keys import part_file
+from tcmrl_data.store.part_record import PartRecord, References
 
 STEPS = 10_000
 """Environment steps between two snapshots."""
@@ -39,6 +41,23 @@ def generate_dataset(
     Returns:
         The number of transitions.
     """
+    plan = plan_noise(environment_name, tasks=tasks, snapshots=snapshots, episodes=episodes, seed=seed)
+    make_folders(folder)
+    ledger = Ledger(plan, folder)
+    ledger.begin()
+    for task in plan.tasks:
+        for key in ledger.missing(task.index):
+            record, archive = noise_part(plan, task, key.step)
+            replace_file(folder / part_file(key), archive, staging=folder / STAGING)
+            ledger.take_in(Published.of_record(record, run=key.run, archive=archive))
+    ledger.seal()
+    return tasks * snapshots * episodes * plan.environment.settings.horizon
+
+
+def plan_noise(
+    environment_name: str, *, tasks: int, snapshots: int, episodes: int, seed: int = 0
+) -> BuildPlan:
+    """The plan of `generate_dataset`; arguments as there."""
     steps = [STEPS * i for i in range(snapshots)]
     overrides = (
         f"behavior.sac.snapshots={steps}",
@@ -48,21 +67,15 @@ def generate_dataset(
     )
     recipe = tcmrl_data.load_recipe(environment_name, overrides=overrides, behavior="sac")
     chosen = [task for task in choose_tasks(recipe) if task.split == "train"][:tasks]
-    plan = BuildPlan.of_tasks(recipe, seed=seed, tasks=chosen)
-    make_groups(folder, chosen)
-    for task in chosen:
-        for step in steps:
-            if not (folder / part_folder(task.index, step)).is_dir():
-                _publish(folder, plan, task, step)
-    Driver(plan, folder).write_manifest()
-    return len(chosen) * snapshots * episodes * plan.environment.settings.horizon
+    return BuildPlan.of_tasks(recipe, seed=seed, tasks=chosen)
 
 
-def _publish(folder: Path, plan: BuildPlan, task: Task, step: int) -> None:
+def noise_part(plan: BuildPlan, task: Task, step: int) -> tuple[PartRecord, bytes]:
+    """The record and the archive of a part whose episodes are white noise."""
     random = np.random.default_rng([plan.seed, task.index, step])
     trajectories = [_noise(random, plan.environment) for _ in range(plan.recipe.rollouts.episodes)]
     snapshot = Snapshot(step, ScriptedDescription(observation="stored", noise=1.0))
-    _, files = seal_part(
+    return seal_part(
         plan,
         task=task,
         snapshot=snapshot,
@@ -70,7 +83,6 @@ def _publish(folder: Path, plan: BuildPlan, task: Task, step: int) -> None:
         references=References(uniform=-1.0, oracle=0.0, scripted=None),
         behavior={"generated": "white noise"},
     )
-    publish_folder(folder, folder / part_folder(task.index, step), files, attempt="generated")
 
 
 def _noise(random: np.random.Generator, environment: Environment) -> Trajectory:

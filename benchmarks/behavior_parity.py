@@ -47,7 +47,9 @@ def curves(recipe: Recipe, tasks: list[Task], seed: int) -> Returns:
         observation=recipe.behavior.observation,
         reward=recipe.behavior.reward,
         report=lambda count: None,
-        checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
+        checkpoints=lambda tasks: CheckpointFolder(
+            Path(os.devnull), "", key="", missing={}, seconds=math.inf
+        ),
     )
     found = defaultdict(list)
     for task, snapshot in plan.source.snapshots(context):

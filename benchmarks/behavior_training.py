@@ -62,7 +62,9 @@ def measure(recipe: Recipe, num_tasks: int, seconds: float) -> float:
         observation=recipe.behavior.observation,
         reward=recipe.behavior.reward,
         report=report,
-        checkpoints=lambda tasks: CheckpointFolder(Path(os.devnull), "", key="", before=0, seconds=math.inf),
+        checkpoints=lambda tasks: CheckpointFolder(
+            Path(os.devnull), "", key="", missing={}, seconds=math.inf
+        ),
     )
     try:
         for _ in recipe.make_source().snapshots(context):

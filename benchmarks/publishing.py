@@ -21,7 +21,6 @@ from tcmrl_data.foundation import canonical
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import Disk, make_folders
 from tcmrl_data.recipe.tasks import choose_tasks
-from tcmrl_data.store.manifest import part_folder
 
 
 class Stopwatch:
@@ -54,7 +53,7 @@ def main() -> None:
     canonical.hashlib = SimpleNamespace(sha256=hashes(hashlib.sha256))  # type: ignore[assignment]
     with tempfile.TemporaryDirectory(dir=".") as folder:
         dataset = Path(folder).resolve() / "data"
-        make_folders((dataset / part_folder(task.index, 0)).parent)
+        make_folders(dataset)
         started = time.perf_counter()
         run_unit(UnitSpec(dataset, recipe, 0, (task,)), lambda message: None)
         seconds = time.perf_counter() - started

@@ -25,7 +25,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,9 @@ from numcodecs.zstd import Zstd
 
 import tcmrl_data
 from tcmrl_data import Trajectories, Transitions, Windows
+from tcmrl_data.store.archive import Archive
+from tcmrl_data.store.keys import PARTS
+from tcmrl_data.store.layout import ARRAYS
 
 SIZES = {"half-cheetah-vel": (20, 10, 50), "ml1/reach": (20, 4, 50)}
 """Tasks, snapshots per task, episodes per snapshot: 2 million steps."""
@@ -95,7 +98,7 @@ def measure(folder: Path, repeats: int) -> dict[str, Any]:
         "environment": dataset.name,
         "observation_dim": dimensions[0],
         "action_dim": dimensions[1],
-        "transitions": sum(dataset.part(*key).statistics.steps for key in _parts(dataset)),
+        "transitions": dataset.manifest.totals.steps,
         "memcpy_bytes_per_s": _median(copied),
         "ours": _rates(rates["ours"], sizes),
         "peers": {name: _rates(rates[name], sizes) for name in peers} | missing,
@@ -117,12 +120,6 @@ def measure(folder: Path, repeats: int) -> dict[str, Any]:
     }
 
 
-def _parts(dataset: tcmrl_data.Dataset) -> Iterator[tuple[int, int]]:
-    for task in dataset.tasks:
-        for step in dataset.snapshots(task.index):
-            yield task.index, step
-
-
 def _opening(folder: Path, repeats: int) -> dict[str, list[float]]:
     """Seconds from opening to the first full batch, and for reading and decompressing the same files once."""
     kinds = {
@@ -132,7 +129,7 @@ def _opening(folder: Path, repeats: int) -> dict[str, list[float]]:
         "windows": Windows(32, length=10),
     }
     request = tcmrl_data.BatchRequest(tasks=16, kinds=kinds)
-    chunks = [path for path in folder.glob("tasks/*/snapshots/*/*/c/**/*") if path.is_file()]
+    files = list(folder.glob(f"{PARTS}/*/*/*.zip"))
     first_batch: list[float] = []
     reading: list[float] = []
     for _ in range(repeats):
@@ -142,10 +139,17 @@ def _opening(folder: Path, repeats: int) -> dict[str, list[float]]:
         tcmrl_data.open_sampler(selection, request, seed=0).batch(0)
         first_batch.append(time.perf_counter() - started)
         started = time.perf_counter()
-        for chunk in chunks:
-            Zstd().decode(chunk.read_bytes()[:-4])  # the last four bytes are the checksum
+        for file in files:
+            with Archive(file) as archive:
+                for name in filter(_is_chunk, archive.names):
+                    Zstd().decode(archive.read(name)[:-4])  # the last four bytes are the checksum
         reading.append(time.perf_counter() - started)
     return {"open_to_first_batch_s": first_batch, "read_bytes_s": reading}
+
+
+def _is_chunk(name: str) -> bool:
+    """Whether a member of a part's archive holds a chunk of an array."""
+    return name.startswith(f"{ARRAYS}/") and not name.endswith("zarr.json")
 
 
 def _our_draws(dataset: tcmrl_data.Dataset, work: Work) -> dict[str, Draw]:

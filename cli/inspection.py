@@ -79,9 +79,7 @@ def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recomp
     if recompute:
         difference = first_disagreement(tcmrl_data.return_table(opened), table)
         if difference is not None:
-            fail_incomplete(
-                f"{opened.folder}: {difference}; delete the part's folder and run the build again"
-            )
+            fail_incomplete(f"{opened.folder}: {difference}; run `tcmrl-data repair {opened.folder} --deep`")
 
 
 def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:

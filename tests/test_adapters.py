@@ -35,9 +35,9 @@ from tests.conftest import TASKS
 def terminated_early(original: Callable[..., list[Trajectory]]) -> Callable[..., list[Trajectory]]:
     """Cuts episode e of a part to 20 - e steps; odd episodes are terminated, even ones truncated."""
 
-    def trajectories(self: Dataset, task: int, step: int) -> list[Trajectory]:
+    def trajectories(self: Dataset, task: int, step: int, run: str = "main") -> list[Trajectory]:
         result = []
-        for index, episode in enumerate(original(self, task, step)):
+        for index, episode in enumerate(original(self, task, step, run)):
             steps = len(episode) - index
             ended = np.arange(steps) == steps - 1
             result.append(
@@ -98,9 +98,9 @@ def test_torch_dataset_reads_lazily_and_keeps_what_it_may(
     read: list[tuple[int, int]] = []
     original = Dataset.trajectories
 
-    def count(self: Dataset, task: int, step: int) -> list[Trajectory]:
+    def count(self: Dataset, task: int, step: int, run: str = "main") -> list[Trajectory]:
         read.append((task, step))
-        return original(self, task, step)
+        return original(self, task, step, run)
 
     monkeypatch.setattr(Dataset, "trajectories", count)
     served = TrajectoryDataset(tiny.select(tasks=[40]), kept_parts=kept_parts)
@@ -222,8 +222,8 @@ def test_minari_refuses_an_episode_without_steps(
     pytest.importorskip("minari")
     none = np.zeros(0, dtype=bool)
     empty = Trajectory(np.zeros((1, 2)), np.zeros((0, 2)), np.zeros(0), none, none)
-    monkeypatch.setattr(Dataset, "trajectories", lambda self, task, step: [empty])
-    with pytest.raises(StoreError, match=r"step_0000150: episode 0 has no steps.*hdf5"):
+    monkeypatch.setattr(Dataset, "trajectories", lambda self, *key: [empty])
+    with pytest.raises(StoreError, match=r"0000150.zip: episode 0 has no steps.*hdf5"):
         MinariFormat().export(tiny, tmp_path / "out", snapshots="last")
     assert list(tmp_path.iterdir()) == []
 

@@ -237,14 +237,15 @@ def test_a_dataset_whose_environment_is_not_installed_is_still_listed_and_inspec
     values = json.loads((folder / MANIFEST).read_bytes())
     del values["digest"]
     values["name"] = "pole"
-    values["recipe"]["environment"].update(name="pole", lengths=[0.5, 1.0])
+    recipe = values["runs"][0]["recipe"]
+    recipe["environment"].update(name="pole", lengths=[0.5, 1.0])
     (folder / MANIFEST).write_bytes(seal(values))
     code, output, _ = call("list", folder.parent, "--json")
     assert (code, [row.get("name") for row in json.loads(output)["datasets"]]) == (0, ["pole"])
     for subject in ("tasks", "snapshots", "returns"):
         assert call("inspect", subject, folder)[0] == 0
     settings = tcmrl_data.open_dataset(folder).manifest.recipe.unit_settings()
-    assert settings["environment"] == values["recipe"]["environment"]
+    assert settings["environment"] == recipe["environment"]
 
 
 def test_recipe_prints_the_values_of_a_recipe_as_json(call: Call, tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ import numpy as np
 import pytest
 from tcmrl_cli.data import data
 
-from tcmrl_data import Dataset
+from tcmrl_data import Dataset, open_dataset
+from tcmrl_data.store.manifest import Totals
+from tcmrl_data.verification.tables import write_tables
 from tests.commands import Call, assert_refused, in_process
 from tests.conftest import TASKS
 from tests.terminal import assert_fits, in_terminal
@@ -40,9 +42,7 @@ def test_show_puts_a_dataset_on_one_screen(call: Call, tiny: Dataset) -> None:
     assert counts == {"tasks": 5, "train": 4, "test": 1, "parts": 15, "parts_total": 15, "episodes": 90}
     assert (document["steps"], document["snapshots"]) == (90 * 20, [0, 100, 150])
     assert (document["root"], document["complete"]) == (tiny.manifest.root, True)
-    files = [file for part in tiny.folder.glob("tasks/*/snapshots/*") for file in part.rglob("*")]
-    stored = sum(file.stat().st_size for file in files if file.is_file() and file.name != "part.json")
-    assert document["bytes"] == stored
+    assert document["bytes"] == sum(file.stat().st_size for file in tiny.folder.glob("parts/*/*/*.zip"))
     assert "torch" in document["made_with"]["packages"][0]
     shown = in_terminal("tcmrl-data", "show", tiny.folder)
     assert_fits(shown.output)
@@ -97,8 +97,8 @@ def test_recompute_agrees_and_notices_changed_rewards(
     assert (code, errors) == (0, "")
     assert output == recorded
 
-    def changed(self: Dataset, task: int, step: int) -> list[Any]:
-        episodes = original(self, task, step)
+    def changed(self: Dataset, task: int, step: int, run: str = "main") -> list[Any]:
+        episodes = original(self, task, step, run)
         if (task, step) == (40, 100):
             episodes[0].rewards[0] += 1.0
         return episodes
@@ -154,10 +154,10 @@ def test_an_output_without_unicode_gets_question_marks(tiny: Dataset) -> None:
 def test_inspect_snapshots_shows_every_part(call: Call, tiny: Dataset) -> None:
     rows = json.loads(call("inspect", "snapshots", tiny.folder, "--json")[1])["snapshots"]
     assert [(row["task"], row["step"], row["id"]) for row in rows] == [
-        (part.task, part.step, part.id) for part in tiny.manifest.parts
+        (part.task, part.step, part.id) for part in tiny.parts.entries()
     ]
     output = call("inspect", "snapshots", tiny.folder)[1]
-    assert all(part.id[:12] in output for part in tiny.manifest.parts)
+    assert all(part.id[:12] in output for part in tiny.parts.entries())
 
 
 def test_inspect_episodes_of_one_part(call: Call, tiny: Dataset) -> None:
@@ -185,12 +185,14 @@ def test_an_incomplete_dataset_can_be_inspected(call: Call, tiny_copy: Copy) -> 
 
 def forget_parts(folder: Path, *, task: int) -> None:
     """Makes the manifest that a build leaves when it is stopped before a task's first part."""
-    from tcmrl_data.store.manifest import PartEntry, merkle_root, read_manifest, seal
-
-    manifest = read_manifest(folder)
-    fields = manifest.model_dump(mode="json", exclude={"digest"})
-    fields["parts"] = [part for part in fields["parts"] if part["task"] != task]
-    fields["references"].pop(str(task))
-    fields["root"] = merkle_root(PartEntry(**part) for part in fields["parts"])
-    fields["complete"] = False
-    (folder / "manifest.json").write_bytes(seal(fields))
+    dataset = open_dataset(folder)
+    table = dataset.parts.without_tasks([task])
+    totals = Totals(
+        parts=len(table),
+        episodes=table.total("episodes"),
+        steps=table.total("steps"),
+        bytes=table.total("size"),
+    )
+    manifest = dataset.manifest.model_copy(update={"root": table.root, "totals": totals, "complete": False})
+    platforms = dataset.manifest.platforms
+    write_tables(folder, manifest, tasks=dataset.tasks, table=table, platforms=platforms)

@@ -1,4 +1,5 @@
 import json
+import pickle
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -7,9 +8,15 @@ import numpy as np
 import pytest
 
 from tcmrl_data import Dataset, list_datasets, open_dataset
-from tcmrl_data.foundation.canonical import digest
+from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TaskError
+from tcmrl_data.store.archive import Archive, pack_archive
+from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, seal
+from tcmrl_data.store.part_record import RECORD
+from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
+from tcmrl_data.store.task_table import TASKS as TASKS_TABLE
+from tcmrl_data.verification.tables import write_tables
 from tests.conftest import TASKS
 
 Copy = Callable[[], Path]
@@ -22,11 +29,18 @@ def test_a_dataset_opens_by_folder_or_manifest(tiny: Dataset, tiny_folder: Path)
     assert [task.index for task in tiny.test_tasks] == [3]
 
 
+def test_a_dataset_can_be_sent_to_another_process(tiny: Dataset) -> None:
+    tiny.part(0, 150)  # what is kept in memory does not travel
+    sent = pickle.loads(pickle.dumps(tiny))
+    assert sent.manifest == tiny.manifest
+    assert sent.part(0, 150) == tiny.part(0, 150)
+
+
 def test_episodes_are_complete_and_time_limits_are_no_terminals(tiny: Dataset) -> None:
     episodes = tiny.trajectories(0, 150)
     assert len(episodes) == 6
     for episode in episodes:
-        assert (episode.observations.shape, episode.observations.dtype) == ((21, 2), np.float32)
+        assert (episode.observations.shape, episode.observations.dtype.name) == ((21, 2), "float32")
         assert np.abs(episode.actions).max() <= 1
         assert not episode.terminated.any()
         assert episode.truncated.tolist() == [False] * 19 + [True]
@@ -48,12 +62,16 @@ def test_recorded_statistics_are_those_of_the_arrays(tiny: Dataset) -> None:
     assert statistics.moments["observations"]["count"] == 6 * 21
 
 
+def keys(task: int, *steps: int) -> tuple[PartKey, ...]:
+    return tuple(PartKey(task, step) for step in steps)
+
+
 def test_selections(tiny: Dataset) -> None:
-    assert tiny.select(split="train").steps == dict.fromkeys((0, 40, 60, 99), (0, 100, 150))
-    assert tiny.select(tasks=[3], snapshots="last").steps == {3: (150,)}
-    assert tiny.select(tasks=[3], snapshots="steps >= 100").steps == {3: (100, 150)}
-    best = tiny.select(tasks=[60], snapshots="return>=1.0").steps[60]
-    assert best == (max((0, 100, 150), key=lambda step: tiny.part(60, step).statistics.mean),)
+    assert tiny.select(split="train").parts == {task: keys(task, 0, 100, 150) for task in (0, 40, 60, 99)}
+    assert tiny.select(tasks=[3], snapshots="last").parts == {3: keys(3, 150)}
+    assert tiny.select(tasks=[3], snapshots="steps >= 100").parts == {3: keys(3, 100, 150)}
+    best = tiny.select(tasks=[60], snapshots="return>=1.0").parts[60]
+    assert best == keys(60, max((0, 100, 150), key=lambda step: tiny.part(60, step).statistics.mean))
     assert len(tiny.select(tasks=[3], snapshots="last").trajectories(3)) == 6
 
 
@@ -77,7 +95,7 @@ def test_an_unknown_task_is_named(tiny: Dataset) -> None:
 
 
 def rewritten(folder: Path, **changes: object) -> None:
-    """Changes manifest fields and updates the root to match."""
+    """Changes manifest fields and seals the manifest again."""
     values = json.loads((folder / MANIFEST).read_bytes()) | changes
     values.pop("digest")
     (folder / MANIFEST).write_bytes(seal(values))
@@ -87,7 +105,7 @@ def test_manifests_that_must_not_open(tiny_copy: Copy) -> None:
     folder = tiny_copy()
     file = folder / MANIFEST
     good = file.read_bytes()
-    values = json.loads(good)
+    run = json.loads(good)["runs"][0]
 
     def refuse(pattern: str) -> None:
         with pytest.raises(ManifestError, match=pattern):
@@ -98,18 +116,22 @@ def test_manifests_that_must_not_open(tiny_copy: Copy) -> None:
     refuse("not a manifest")
     file.write_bytes(good.replace(b'"seed":0', b'"seed":1', 1))
     refuse("digest does not match")
-    rewritten(folder, schema_version=2)
-    refuse("schema_version 2 is not 1")
+    rewritten(folder, schema_version=3)
+    refuse("schema_version 3 is not 2")
+    rewritten(folder, schema_version=1, seed=0, recipe={"profile": "quick"})
+    refuse("earlier tcmrl.*`tcmrl-data build point-robot --profile quick --seed 0 --out FOLDER`")
     rewritten(folder, surprise=1)
     refuse("surprise: Extra inputs")
-    rewritten(folder, seed="0")
-    refuse("seed: Input should be a valid integer")
-    rewritten(folder, root="0" * 64)
-    refuse("root does not match")
+    rewritten(folder, runs=[run | {"seed": "0"}])
+    refuse("runs.0.seed: Input should be a valid integer")
+    rewritten(folder, root="0" * 63)
+    refuse("root: ")
     rewritten(folder, name="../etc")
     refuse("name: ")
-    rewritten(folder, parts=[*values["parts"], values["parts"][0]])
-    refuse("sorted by task and step, each once")
+    rewritten(folder, runs=[run, run])
+    refuse("runs must have different names")
+    rewritten(folder, parts={"lines": 1_000_002, "bytes": 1, "sha256": "0" * 64})
+    refuse("at most 100000 tasks and 1000000 parts")
     file.write_bytes(good.replace(b'{"complete"', b'{"complete":true,"complete"', 1))
     refuse("duplicate key 'complete'")
     file.write_bytes(good.replace(b'"seed":0', b'"seed":NaN', 1))
@@ -121,35 +143,99 @@ def test_manifests_that_must_not_open(tiny_copy: Copy) -> None:
     open_dataset(folder)
 
 
-@pytest.mark.parametrize("name", ["rewards/c/0", "episode_offsets/zarr.json", "part.json", "policy.json"])
-def test_a_missing_or_linked_file_is_named(tiny_copy: Copy, tmp_path: Path, name: str) -> None:
+@pytest.mark.parametrize("name", [TASKS_TABLE, PARTS_TABLE])
+@pytest.mark.parametrize("damage", ["missing", "shorter", "edited", "linked"])
+def test_a_damaged_table_is_named_when_it_is_first_used(
+    tiny_copy: Copy, tmp_path: Path, name: str, damage: str
+) -> None:
     folder = tiny_copy()
-    file = folder / "tasks/00060/snapshots/step_0000150" / name
-    moved = tmp_path / "elsewhere"
+    file, moved = folder / name, tmp_path / "elsewhere"
+    content = file.read_bytes()
     file.rename(moved)
-    with pytest.raises((StoreError, ManifestError), match=str(file)):
-        open_dataset(folder)
+    if damage == "linked":
+        file.symlink_to(moved)
+    elif damage != "missing":
+        file.write_bytes(content[:-1] if damage == "shorter" else content.replace(b"0", b"1", 1))
+    dataset = open_dataset(folder)
+    with pytest.raises(ManifestError, match=str(file)):
+        _ = dataset.tasks if name == TASKS_TABLE else dataset.parts
+
+
+def test_a_table_of_another_root_is_refused(tiny_copy: Copy) -> None:
+    folder = tiny_copy()
+    rewritten(folder, root="0" * 64)
+    with pytest.raises(ManifestError, match="do not have the manifest's root"):
+        open_dataset(folder).select()
+
+
+def test_lines_behind_the_sealed_ones_do_not_count(tiny: Dataset, tiny_copy: Copy) -> None:
+    folder = tiny_copy()
+    for name in (TASKS_TABLE, PARTS_TABLE):
+        with (folder / name).open("ab") as file:
+            file.write(b"the log of a build\n")
+    opened = open_dataset(folder)
+    assert (opened.tasks, list(opened.parts)) == (tiny.tasks, list(tiny.parts))
+
+
+def test_a_missing_or_linked_part_is_named(tiny_copy: Copy, tmp_path: Path) -> None:
+    folder = tiny_copy()
+    file, moved = folder / part_file(PartKey(60, 150)), tmp_path / "elsewhere"
+    task_folder, moved_folder = file.parent, tmp_path / "folder"
+
+    def refuse(place: Path) -> None:
+        for read in (Dataset.part, Dataset.trajectories, Dataset.snapshot):
+            with pytest.raises(StoreError, match=str(place)):
+                read(open_dataset(folder), 60, 150)
+
+    file.rename(moved)
+    refuse(file)
     file.symlink_to(moved)
-    with pytest.raises((StoreError, ManifestError), match=str(file)):
-        open_dataset(folder)
+    refuse(file)
+    file.unlink()
+    moved.rename(file)
+    task_folder.rename(moved_folder)
+    task_folder.symlink_to(moved_folder)
+    refuse(task_folder)
+
+
+def test_a_part_of_another_size_is_found(tiny_copy: Copy) -> None:
+    file = tiny_copy() / part_file(PartKey(60, 150))
+    file.write_bytes(file.read_bytes()[:-1])
+    with pytest.raises(StoreError, match=r"has \d+ bytes instead of \d+|does not end as an archive"):
+        open_dataset(file.parents[3]).part(60, 150)
 
 
 def test_a_swapped_part_is_found(tiny_copy: Copy) -> None:
     folder = tiny_copy()
-    left, right = (folder / "tasks/00060/snapshots" / f"step_0000{step}" / "part.json" for step in (100, 150))
-    left.write_bytes(right.read_bytes())
-    with pytest.raises(ManifestError, match="not the record that the manifest names"):
-        open_dataset(folder)
+    dataset = open_dataset(folder)
+    left, right = keys(60, 100, 150)
+    (folder / part_file(left)).write_bytes((folder / part_file(right)).read_bytes())
+    with pytest.raises(StoreError, match=r"has \d+ bytes instead of"):
+        open_dataset(folder).part(*left)
+    same_size = dataset.entry(left)._replace(size=dataset.entry(right).size)
+    table = [same_size if entry.key == left else entry for entry in dataset.parts.entries()]
+    write_tables(
+        folder,
+        dataset.manifest,
+        tasks=dataset.tasks,
+        table=PartTable.empty().with_entries(table),
+        platforms=dataset.manifest.platforms,
+    )
+    with pytest.raises(ManifestError, match="not the part that the manifest names"):
+        open_dataset(folder).part(*left)
 
 
 def test_a_part_with_an_edited_identity_is_found(tiny_copy: Copy) -> None:
-    file = tiny_copy() / "tasks/00060/snapshots/step_0000150/part.json"
-    values = json.loads(file.read_bytes())
+    folder = tiny_copy()
+    file = folder / part_file(PartKey(60, 150))
+    with Archive(file) as archive:
+        files = {name: archive.read(name) for name in archive.names}
+    values = json.loads(files[RECORD])
     values["identity"]["seed"] = 9
     assert values["id"] != digest(values["identity"])
-    file.write_text(json.dumps(values))
+    file.write_bytes(pack_archive(files | {RECORD: canonical_json(values)}))
     with pytest.raises(ManifestError, match="id is not the digest"):
-        open_dataset(file.parents[4])
+        open_dataset(folder).part(60, 150)
 
 
 def test_datasets_are_listed(tiny_folder: Path, tiny_copy: Copy) -> None:

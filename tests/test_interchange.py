@@ -65,10 +65,10 @@ class TestEveryFormat:
     ) -> None:
         original = Dataset.trajectories
 
-        def fail_late(self: Dataset, task: int, step: int) -> list[Trajectory]:
+        def fail_late(self: Dataset, task: int, step: int, run: str = "main") -> list[Trajectory]:
             if task == TASKS[-1]:
                 raise StoreError("damaged")
-            return original(self, task, step)
+            return original(self, task, step, run)
 
         monkeypatch.setattr(Dataset, "trajectories", fail_late)
         with pytest.raises(StoreError, match="damaged"):
@@ -139,7 +139,7 @@ def test_hdf5_round_trip_of_any_episodes(
     """Lengths 0 and 1, terminations and success flags; every part has the same episodes."""
     out = tmp_path_factory.mktemp("round-trip") / "flat"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Dataset, "trajectories", lambda self, task, step: episodes)
+        patch.setattr(Dataset, "trajectories", lambda self, *key: episodes)
         Hdf5Format().export(tiny, out, snapshots="steps>=100")
     for left, right in zip(episodes * 2, read_hdf5(out / "task_00000.hdf5"), strict=True):
         assert_equal(left, right)

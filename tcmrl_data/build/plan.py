@@ -48,7 +48,7 @@ class BuildPlan:
         """The plan of a recipe for tasks that are known already."""
         return cls(recipe, seed, recipe.make_environment(), _ordered(tasks), frozenset(dropped))
 
-    @property
+    @functools.cached_property
     def wanted(self) -> tuple[Task, ...]:
         """The tasks of which parts are made."""
         return tuple(task for task in self.tasks if task.index not in self.dropped)

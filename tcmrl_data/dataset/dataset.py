@@ -65,6 +65,10 @@ class Dataset:
         self.folder, self.manifest = folder, manifest
         self._record = functools.lru_cache(KEPT_RECORDS)(self._read_record)
 
+    def __reduce__(self) -> tuple[type["Dataset"], tuple[Path, Manifest]]:
+        """Another process gets the manifest, and reads tables and parts by itself."""
+        return Dataset, (self.folder, self.manifest)
+
     @property
     def name(self) -> str:
         """The environment's name."""
