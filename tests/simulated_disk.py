@@ -2,60 +2,77 @@
 
 import errno
 import os
+import shutil
 import signal
-from collections.abc import Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import pytest
 
 import tcmrl_data
-from tcmrl_data import BuildReport, Dataset, Recipe, TcmrlError
-from tcmrl_data.build import build
+from tcmrl_data import BuildEvent, BuildReport, Dataset, Recipe, TcmrlError
+from tcmrl_data.build import build, ledger
+from tcmrl_data.build.published import read_published
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation import disk as publish
-from tcmrl_data.foundation.disk import Disk, publish_folder
-from tcmrl_data.store.manifest import part_folder
+from tcmrl_data.foundation.disk import STAGING, Disk, replace_file
+from tcmrl_data.store import tables
+from tcmrl_data.store.keys import PartKey, part_file
 
-Fault = Literal["kill", "torn", "full", "broken"]
-FAULTS: tuple[Fault, ...] = ("kill", "torn", "full", "broken")
-Operation = tuple[str, Path, Path | bytes | None]
+Fault = Literal["kill", "torn", "full", "broken", "once"]
+FAULTS: tuple[Fault, ...] = ("kill", "torn", "full", "broken", "once")
+Loss = Literal["all", "content", "nothing", "half", "zeros", "even names", "odd names"]
+LOSSES: tuple[Loss, ...] = ("all", "content", "nothing", "half", "zeros", "even names", "odd names")
+"""What a power cut takes of what was not forced to disk."""
+Operation = tuple[str, Path, Path | bytes | tuple[int, bytes] | None]
 
 
 class PreparedParts:
-    """All parts of one task of a real dataset, published again by the code that workers use."""
+    """Parts of a real dataset, which builds publish again as workers do, instead of making them."""
 
-    def __init__(self, dataset: Dataset, recipe: Recipe, task: int) -> None:
-        self.recipe, self.task = recipe, task
-        self.parts = {
-            step: {
-                path.relative_to(folder).as_posix(): path.read_bytes()
-                for path in sorted(folder.rglob("*"))
-                if path.is_file()
-            }
-            for step in dataset.snapshots(task)
-            for folder in [dataset.folder_of(task, step)]
+    def __init__(self, dataset: Dataset, recipe: Recipe, tasks: Sequence[int]) -> None:
+        self.recipe, self.tasks = recipe, tasks
+        self.files = {
+            key: dataset.file_of(key).read_bytes() for task in tasks for key in dataset.parts.keys_of(task)
         }
 
-    def build(self, out: Path, patch: pytest.MonkeyPatch) -> BuildReport:
-        """A build of the task whose one unit publishes the prepared parts."""
-        parts, task = self.parts, self.task
+    def build(
+        self,
+        out: Path,
+        patch: pytest.MonkeyPatch,
+        *,
+        tasks: Sequence[int] | None = None,
+        progress: Callable[[BuildEvent], None] = lambda event: None,
+    ) -> BuildReport:
+        """A build whose units publish the prepared parts."""
+        files = self.files
+
+        def publish_part(key: PartKey) -> Mapping[str, Any]:
+            file = out / part_file(key)
+            if not file.exists():
+                replace_file(file, files[key], staging=out / STAGING)
+            return read_published(file, key.run)[0].to_message()
 
         class Engine(BaseEngine):
             def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
                 for unit in units:
-                    try:
-                        for step, files in parts.items():
-                            publish_folder(out, out / part_folder(task, step), files, attempt="prepared")
-                            on_message(unit.id, {"kind": "part", "task": task, "step": step})
-                    except TcmrlError as error:
-                        yield Result(unit.id, False, None, str(error), 1, "here")
-                    else:
-                        yield Result(unit.id, True, "digest", None, 1, "here")
+                    indices = {index for index, *_ in unit.spec["tasks"]}
+                    error = None
+                    for key in files:
+                        if key.task in indices and error is None:
+                            try:
+                                message = publish_part(key)
+                            except TcmrlError as problem:
+                                error = str(problem)
+                            else:
+                                on_message(unit.id, message)
+                    yield Result(unit.id, error is None, None if error else "digest", error, 1, "here")
 
         patch.setattr(build.ENGINES, "get", lambda name: Engine)
-        return tcmrl_data.build_dataset(self.recipe, out, tasks=[task], workers=1)
+        tasks = self.tasks if tasks is None else tasks
+        return tcmrl_data.build_dataset(self.recipe, out, tasks=tasks, workers=1, progress=progress)
 
 
 class RecordingDisk(Disk):
@@ -72,6 +89,14 @@ class RecordingDisk(Disk):
         super().write(path, data)
         self.log.append(("write", path, data))
 
+    def write_at(self, path: Path, offset: int, data: bytes) -> None:
+        super().write_at(path, offset, data)
+        self.log.append(("write_at", path, (offset, data)))
+
+    def truncate(self, path: Path, size: int) -> None:
+        super().truncate(path, size)
+        self.log.append(("truncate", path, (size, b"")))
+
     def sync(self, path: Path) -> None:
         super().sync(path)
         self.log.append(("sync", path, None))
@@ -82,19 +107,22 @@ class RecordingDisk(Disk):
 
 
 class FaultyDisk(Disk):
-    """Fails at one operation: the process dies, dies in the middle of a write, or the system refuses."""
+    """Fails at one operation: the process dies, dies in the middle of a write, or the system refuses.
+
+    The system refuses all later operations too, but after the fault `once`.
+    """
 
     def __init__(self, at: int, fault: Fault) -> None:
         self._left, self._fault = at, fault
 
-    def _count(self, path: Path, data: bytes = b"") -> None:
+    def _count(self, path: Path, data: bytes = b"", offset: int = 0) -> None:
         self._left -= 1
-        if self._left >= 0:
+        if self._left >= 0 or (self._fault == "once" and self._left < -1):
             return
         if self._fault == "kill":
             os.kill(os.getpid(), signal.SIGKILL)
         if data:
-            path.write_bytes(data[: len(data) // 2])
+            Disk().write_at(path, offset, data[: len(data) // 2])
         if self._fault == "torn":
             os.kill(os.getpid(), signal.SIGKILL)
         raise OSError(errno.ENOSPC if self._fault == "full" else errno.EIO, "injected")
@@ -106,6 +134,14 @@ class FaultyDisk(Disk):
     def write(self, path: Path, data: bytes) -> None:
         self._count(path, data)
         super().write(path, data)
+
+    def write_at(self, path: Path, offset: int, data: bytes) -> None:
+        self._count(path, data, offset)
+        super().write_at(path, offset, data)
+
+    def truncate(self, path: Path, size: int) -> None:
+        self._count(path)
+        super().truncate(path, size)
 
     def sync(self, path: Path) -> None:
         self._count(path)
@@ -123,13 +159,27 @@ def run_with_fault(parts: PreparedParts, out: Path, at: int, fault: Fault) -> in
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     status = 3
     try:
-        publish.disk = FaultyDisk(at, fault)
+        publish.disk = tables.disk = FaultyDisk(at, fault)
         with pytest.MonkeyPatch.context() as patch:
             status = 1 if parts.build(out, patch).failed else 0
     except TcmrlError:
         status = 1
     finally:
         os._exit(status)
+
+
+def at_last_part(parts: PreparedParts, out: Path, patch: pytest.MonkeyPatch) -> None:
+    """Leaves what a build leaves that is killed after its last part, before the manifest names any."""
+    patch.setattr(ledger, "SEAL_SECONDS", 1e9)
+    kept = out.with_name("at the last part")
+
+    def copy(event: BuildEvent) -> None:
+        if event.kind == "part" and event.parts_done == len(parts.files):
+            shutil.copytree(out, kept)
+
+    parts.build(out, patch, progress=copy)
+    shutil.rmtree(out)
+    kept.rename(out)
 
 
 @dataclass
@@ -146,12 +196,25 @@ class _Node:
 class PowerCut:
     """Replays a log of operations and shows what a power cut would leave.
 
-    A file's bytes are durable after it was synced; a name in a folder is durable after the folder was.
+    A file's bytes are durable after it was synced; a name in a folder is durable after the folder was. Of
+    what is not durable a power cut may leave nothing, all of it, the first half of a file's new bytes, zeros
+    in their place, or some names of a folder and not the others.
     """
 
     def __init__(self, root: Path) -> None:
         self._root = root
         self._tree = _Node(is_folder=True)
+
+    def load(self, path: Path) -> None:
+        """Takes a file or folder below the root as it stands, as forced to disk."""
+        node = self._tree if path == self._root else _Node(path.is_dir())
+        if path.is_file():
+            node.content = node.durable_content = path.read_bytes()
+        if path != self._root:
+            parent = self._node(path.parent)
+            parent.entries[path.name] = parent.durable_entries[path.name] = node
+        for child in path.iterdir() if path.is_dir() else ():
+            self.load(child)
 
     def apply(self, operation: Operation) -> None:
         """Applies one recorded operation in memory."""
@@ -162,25 +225,56 @@ class PowerCut:
         elif name == "rename":
             assert isinstance(more, Path)
             self._node(more.parent).entries[more.name] = self._node(path.parent).entries.pop(path.name)
+        elif name == "write_at":
+            assert isinstance(more, tuple)
+            offset, data = more
+            node = self._node(path.parent).entries.setdefault(path.name, _Node(is_folder=False))
+            node.content = (
+                node.content[:offset].ljust(offset, b"\0") + data + node.content[offset + len(data) :]
+            )
+        elif name == "truncate":
+            assert isinstance(more, tuple)
+            self._node(path).content = self._node(path).content[: more[0]]
         else:
             content = more if isinstance(more, bytes) else b""
             self._node(path.parent).entries[path.name] = _Node(name == "make_folder", content)
 
-    def leave(self, out: Path, *, names_survive: bool) -> None:
-        """Writes the state after a power cut, without unsynced bytes; unsynced names may survive."""
-        self._write(self._tree, out, names_survive)
+    def leave(self, out: Path, loss: Loss) -> None:
+        """Writes the state after a power cut."""
+        self._write(self._tree, out, loss)
 
-    def _write(self, node: _Node, path: Path, names_survive: bool) -> None:
+    def _write(self, node: _Node, path: Path, loss: Loss) -> None:
         if not node.is_folder:
-            path.write_bytes(node.durable_content)
+            path.write_bytes(_surviving_content(node, loss))
             return
         path.mkdir(exist_ok=True)
-        entries: Mapping[str, _Node] = node.entries if names_survive else node.durable_entries
-        for name, child in entries.items():
-            self._write(child, path / name, names_survive)
+        for name, child in _surviving_entries(node, loss).items():
+            self._write(child, path / name, loss)
 
     def _node(self, path: Path) -> _Node:
         node = self._tree
         for name in path.relative_to(self._root).parts:
             node = node.entries[name]
         return node
+
+
+def _surviving_content(node: _Node, loss: Loss) -> bytes:
+    new, old = node.content, node.durable_content
+    if loss == "nothing":
+        return new
+    if loss == "half":
+        first = min(len(new), len(old))
+        return new[: first + (len(new) - first) // 2] if new.startswith(old) else new[: len(new) // 2]
+    if loss == "zeros":
+        return old[: len(new)].ljust(len(new), b"\0")
+    return old
+
+
+def _surviving_entries(node: _Node, loss: Loss) -> Mapping[str, _Node]:
+    new, old = node.entries, node.durable_entries
+    if loss in ("all", "nothing", "content", "half", "zeros"):
+        return old if loss == "all" else new
+    changed = sorted(name for name in {*new, *old} if new.get(name) is not old.get(name))
+    changed = changed[loss == "odd names" :: 2]
+    kept = {name: node for name, node in old.items() if name not in changed}
+    return kept | {name: new[name] for name in changed if name in new}

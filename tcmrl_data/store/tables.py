@@ -86,6 +86,7 @@ class TableWriter:
     def __init__(self, file: Path, lines: bytes = b"") -> None:
         self._file = file
         self._state = (hashlib.sha256(lines), seal_of(lines))
+        self._is_named = bool(lines)
 
     def append(self, lines: bytes) -> None:
         """Writes complete lines behind the others; not forced to disk before they are sealed.
@@ -106,7 +107,7 @@ class TableWriter:
             self._state = (hashed, seal)  # one step, so that an interruption leaves the two in agreement
 
     def sync(self) -> None:
-        """Forces the lines to disk, and cuts off what stands behind them.
+        """Forces the lines, and the name of a new table, to disk, and cuts off what stands behind them.
 
         Raises:
             StorageError: the operating system refuses the operation.
@@ -115,6 +116,9 @@ class TableWriter:
             if self.has_more:
                 disk.truncate(self._file, self.seal.bytes)
             disk.sync(self._file)
+            if not self._is_named:
+                disk.sync(self._file.parent)
+        self._is_named = True
 
     @property
     def seal(self) -> TableSeal:
