@@ -15,7 +15,6 @@ from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.build import build
-from tcmrl_data.build.driver import make_groups
 from tcmrl_data.build.events import EVENTS, BuildEvent
 from tcmrl_data.build.plan import plan_build
 from tcmrl_data.build.unit import UnitSpec, run_unit
@@ -23,8 +22,8 @@ from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS
 from tcmrl_data.recipe.tasks import choose_tasks
-from tcmrl_data.store.manifest import read_manifest
 from tests.conftest import TINY
+from tests.datasets import part_ids
 from tests.platforms import AVX2
 
 
@@ -162,11 +161,10 @@ def test_a_unit_that_can_write_no_checkpoint_is_done_nevertheless(
 ) -> None:
     monkeypatch.setattr(CheckpointFolder, "is_due", lambda self: True)
     plan = plan_build(tiny_recipe, tasks=[3])
-    make_groups(tmp_path, plan.tasks)
     (tmp_path / CHECKPOINTS).touch()
     messages: list[Mapping[str, Any]] = []
     made = run_unit(UnitSpec(tmp_path, tiny_recipe, 0, plan.tasks), messages.append)
-    expected = [part.id for part in read_manifest(tiny_folder).parts if part.task == 3]
+    expected = [part_id for (task, _), part_id in part_ids(tiny_folder).items() if task == 3]
     assert made == digest(expected)
     assert [message["kind"] for message in messages].count("warning") == 1
 

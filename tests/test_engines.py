@@ -24,8 +24,10 @@ from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.recipe.tasks import choose_tasks
-from tcmrl_data.store.manifest import part_folder, read_manifest
+from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.store.manifest import read_manifest
 from tests.conftest import TASKS, TINY
+from tests.datasets import part_ids
 from tests.directed import Directions
 from tests.workers import PATIENCE, ROOT, command_line, wait_for, worker_pids
 
@@ -79,7 +81,6 @@ def make_units(recipe: Recipe, out: Path, tasks: list[int]) -> list[Unit]:
     (out / STAGING).mkdir(parents=True)
     units = []
     for task in choose_tasks(recipe, tasks):
-        (out / part_folder(task.index, 0)).parent.mkdir(parents=True)
         spec = UnitSpec(out.resolve(), recipe, 0, (task,))
         units.append(Unit(f"task {task.index}", spec.to_json(), WORKER))
     return units
@@ -91,16 +92,15 @@ def run(engine: EngineCase, units: list[Unit], *, workers: int = 2) -> dict[str,
 
 def reference(tiny: Dataset, task: int) -> str:
     """What a unit must return."""
-    return digest([part.id for part in tiny.manifest.parts if part.task == task])
+    return digest([entry.id for entry in tiny.parts.entries_of(task)])
 
 
 def ids(folder: Path, *tasks: int) -> dict[tuple[int, int], str]:
-    parts = read_manifest(folder).parts
-    return {(part.task, part.step): part.id for part in parts if part.task in (tasks or TASKS)}
+    return {key: part_id for key, part_id in part_ids(folder).items() if key[0] in (tasks or TASKS)}
 
 
 def has_part(out: Path, task: int, step: int) -> bool:
-    return (out / part_folder(task, step) / "part.json").is_file()
+    return (out / part_file(PartKey(task, step))).is_file()
 
 
 def staged(out: Path) -> list[str]:
@@ -146,7 +146,8 @@ def test_an_error_that_a_unit_reports_is_final_and_the_others_are_done(
 ) -> None:
     """Another attempt cannot repair a file in the place of a part."""
     units = make_units(tiny_recipe, tmp_path / "data", [3, 40])
-    blocked = tmp_path / "data" / part_folder(3, 100)
+    blocked = tmp_path / "data" / part_file(PartKey(3, 100))
+    blocked.parent.mkdir(parents=True)
     blocked.write_text("in the way")
     results = run(engine, units)
     assert (results["task 3"].ok, results["task 3"].attempt) == (False, 1)
@@ -184,7 +185,7 @@ def test_a_unit_run_twice_at_once_makes_its_data_once(
     (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
     results = run(engine, [unit, replace(unit, id="again")])
     assert [result.digest for result in results.values()] == [reference(tiny, 40)] * 2
-    assert len(list((tmp_path / "data").rglob("part.json"))) == 3
+    assert len(list((tmp_path / "data").rglob("*.zip"))) == 3
     assert staged(tmp_path / "data") == []
 
 
@@ -230,8 +231,7 @@ def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
     assert driver.returncode == 1
     assert worker_pids(engine.mark) == []
     assert staged(out) == []
-    assert read_manifest(out).parts
-    assert {part.step for part in read_manifest(out).parts} <= {0, 100}
+    assert {step for _, step in part_ids(out)} in ({0}, {0, 100})
 
 
 def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(

@@ -1,6 +1,7 @@
 """Protocols of adaptation, the arena in which they adapt, and the contexts of other tasks."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -18,11 +19,9 @@ STATEFUL = Capabilities(stateful=True, needs_trajectories=False)
 @pytest.fixture
 def two_tests(tiny: Dataset) -> Dataset:
     """The tiny dataset with a second test task."""
-    manifest = tiny.manifest
-    moved = [
-        task.model_copy(update={"split": "test"}) if task.index == 40 else task for task in manifest.tasks
-    ]
-    return Dataset(tiny.folder, manifest.model_copy(update={"tasks": tuple(moved)}))
+    dataset = Dataset(tiny.folder, tiny.manifest)
+    dataset.tasks = tuple(replace(task, split="test") if task.index == 40 else task for task in tiny.tasks)
+    return dataset
 
 
 @pytest.mark.parametrize("protocol", PROTOCOLS.names())

@@ -11,6 +11,7 @@ from stable_baselines3 import SAC
 from tcmrl_data import Dataset, import_sac, load_recipe
 from tcmrl_data.behavior.snapshot import LOG_STD_RANGE, Snapshot, read_snapshot, snapshot_of_sac
 from tcmrl_data.foundation.errors import SnapshotError
+from tcmrl_data.foundation.plain_files import read_plain_file
 
 
 @pytest.fixture(scope="module")
@@ -39,9 +40,16 @@ def write(snapshot: Snapshot, folder: Path) -> Path:
     return folder
 
 
+def read_back(folder: Path) -> Snapshot:
+    def read(name: str, *, limit: int) -> bytes:
+        return read_plain_file(folder / name, limit=limit)
+
+    return read_snapshot(read, 60, place=str(folder))
+
+
 def test_a_snapshot_acts_exactly_like_its_sb3_model(model: SAC, snapshot: Snapshot, tmp_path: Path) -> None:
     environment = load_recipe("point-robot").make_environment()
-    controller = read_snapshot(write(snapshot, tmp_path), 60).controller(environment, [])
+    controller = read_back(write(snapshot, tmp_path)).controller(environment, [])
     observations = np.random.default_rng(0).normal(size=(50, 2)).astype(np.float32)
 
     deterministic, _ = model.predict(observations, deterministic=True)
@@ -73,7 +81,7 @@ def test_hostile_snapshots_are_refused(snapshot: Snapshot, tmp_path: Path) -> No
 
     def refuse(pattern: str) -> None:
         with pytest.raises(SnapshotError, match=pattern):
-            read_snapshot(tmp_path, 60)
+            read_back(tmp_path)
         write(snapshot, tmp_path)
 
     write(snapshot, tmp_path)

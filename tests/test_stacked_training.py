@@ -18,7 +18,7 @@ from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.behavior.stacked.source import StackedSettings, StackedSource, _make_training
 from tcmrl_data.behavior.stacked.training import GroupTraining
-from tcmrl_data.build.driver import Driver, make_groups
+from tcmrl_data.build.ledger import Ledger
 from tcmrl_data.build.plan import BuildPlan, plan_build
 from tcmrl_data.build.unit import UnitSpec, run_unit
 from tcmrl_data.build.work_files import checkpoint_name
@@ -26,8 +26,10 @@ from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import CHECKPOINTS, make_folders
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
-from tcmrl_data.store.manifest import part_folder, read_manifest
+from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.verification.garbage import collect_garbage
+from tests.datasets import part_ids
 
 TINY = (
     "behavior.stacked.group=4",
@@ -87,10 +89,6 @@ def snapshots_of(recipe: Recipe, context: BehaviorContext) -> dict[tuple[int, in
 
 def digests(snapshots: dict[tuple[int, int], Snapshot]) -> dict[tuple[int, int], str]:
     return {key: snapshot.digest() for key, snapshot in snapshots.items()}
-
-
-def ids(folder: Path) -> dict[tuple[int, int], str]:
-    return {(part.task, part.step): part.id for part in read_manifest(folder).parts}
 
 
 def test_what_a_task_draws_and_learns_does_not_depend_on_its_group(tmp_path: Path) -> None:
@@ -161,7 +159,7 @@ def test_ids_do_not_depend_on_workers(dataset: Path, tmp_path: Path) -> None:
     """They do not depend on the order in which groups are built either."""
     for half in ([5], [1, 2, 3]):
         tcmrl_data.build_dataset(recipe_of(), tmp_path / "halves", tasks=half, workers=1)
-    assert ids(tmp_path / "halves") == ids(dataset)
+    assert part_ids(tmp_path / "halves") == part_ids(dataset)
     assert not list((dataset / CHECKPOINTS).glob("*"))
     assert open_dataset(dataset).manifest.complete
 
@@ -170,12 +168,12 @@ def test_a_group_trains_its_done_tasks_again_and_leaves_their_parts_alone(
     dataset: Path, tmp_path: Path
 ) -> None:
     tcmrl_data.build_dataset(recipe_of(), tmp_path / "grown", tasks=[1, 2], workers=1)
-    before = ids(tmp_path / "grown")
+    before = part_ids(tmp_path / "grown")
     report = tcmrl_data.build_dataset(recipe_of(), tmp_path / "grown", tasks=[3], workers=1)
     assert (report.failed, report.built, report.present) == ((), 3, 6)
-    after = ids(tmp_path / "grown")
+    after = part_ids(tmp_path / "grown")
     assert {key: after[key] for key in before} == before
-    assert {key: part for key, part in ids(dataset).items() if key[0] == 3} == {
+    assert {key: part for key, part in part_ids(dataset).items() if key[0] == 3} == {
         key: part for key, part in after.items() if key[0] == 3
     }
 
@@ -191,8 +189,9 @@ def test_gc_keeps_the_checkpoint_of_a_group_until_all_its_tasks_are_done(
     assert [(item.path, item.reason) for item in collect_garbage(folder, dry_run=True)] == [
         (name, "tasks 1 to 3 are done")
     ]
-    shutil.rmtree(folder / part_folder(3, 130))
-    Driver(plan_build(recipe_of(), tasks=TASKS), folder).write_manifest()
+    (folder / part_file(PartKey(3, 130))).unlink()
+    (folder / MANIFEST).unlink()
+    Ledger(plan_build(recipe_of(), tasks=TASKS), folder).begin()
     assert collect_garbage(folder) == ()
     assert (folder / name).is_dir()
 
@@ -290,7 +289,6 @@ def test_the_others_of_a_diverged_agents_group_go_on_from_their_checkpoint(
     recipe = recipe_of(overrides=overrides)
     plan = plan_build(recipe, tasks=[1, 2, 3])
     spec = UnitSpec(tmp_path, recipe, 0, plan.tasks)
-    make_groups(tmp_path, plan.tasks)
     monkeypatch.setattr(CheckpointFolder, "is_due", lambda self: True)
     advance, steps = GroupTraining.advance, 0
 
@@ -312,7 +310,7 @@ def test_the_others_of_a_diverged_agents_group_go_on_from_their_checkpoint(
         (index, step)
         for index in (1, 2, 3)
         for step in plan.source.steps
-        if (tmp_path / part_folder(index, step) / "part.json").is_file()
+        if (tmp_path / part_file(PartKey(index, step))).is_file()
     ]
     assert published == [
         (index, step) for index in (1, 2, 3) for step in (0, 100, 120, 150) if index != 2 or step <= 100
@@ -340,7 +338,7 @@ def test_reduced_precision_is_recorded_with_its_error_and_left_behind_at_once(tm
     recipe = recipe_of(overrides=(*TINY, "behavior.stacked.matmul_precision=medium"))
     assert source_of(recipe_of()).provenance() == {}
     tcmrl_data.build_dataset(recipe, tmp_path / "dataset", tasks=[1, 2], workers=1)
-    recorded = open_dataset(tmp_path / "dataset").part(1, 130).provenance["behavior"]
+    recorded = open_dataset(tmp_path / "dataset").part(1, 130).behavior
     assert recorded["matmul_precision"] == "medium"
     assert 0 < recorded["matmul_error"] < 0.05  # of a product's standard deviation; bfloat16 gives 0.013
     snapshots = source_of(recipe).snapshots(context_of(recipe, [1, 2], tmp_path))
@@ -360,10 +358,7 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
         "rollouts.episodes=10",
     )
     recipe = load_recipe("half-cheetah-vel", profile="quick", overrides=overrides, behavior="stacked")
-    make_folders(tmp_path / "tasks")
     tasks = choose_tasks(recipe, range(20))
-    for task in tasks:
-        make_folders((tmp_path / part_folder(task.index, 0)).parent)
     spec = canonical_json(UnitSpec(tmp_path, recipe, 0, tasks).to_json()).decode()
     program = (
         "import json, resource, sys\n"

@@ -26,6 +26,7 @@ from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_algo.training.train import TrainingProgress
 from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
 from tests.commands import Call, assert_refused, in_process
+from tests.datasets import with_tasks
 
 SMALL = (
     "run.log_every=10",
@@ -247,16 +248,13 @@ def test_what_cannot_start_leaves_nothing(start: Train, tmp_path: Path) -> None:
 
 def test_fewer_than_two_training_tasks_are_refused(tiny: Dataset, tmp_path: Path) -> None:
     train, test = tiny.train_tasks[0], tiny.test_tasks[0]
-    kept = [task for task in tiny.manifest.tasks if task.index in (train.index, test.index)]
-    lone = Dataset(tiny.folder, tiny.manifest.model_copy(update={"tasks": tuple(kept)}))
+    lone = with_tasks(tiny, {train.index, test.index})
     with pytest.raises(SelectionError, match="at least 2 training tasks"):
         train_run(lone, tmp_path / "run", config=config_of(tiny), profile="quick")
 
 
 def test_two_training_tasks_suffice(tiny: Dataset, tmp_path: Path) -> None:
-    chosen = {task.index for task in (*tiny.train_tasks[:2], *tiny.test_tasks)}
-    kept = [task for task in tiny.manifest.tasks if task.index in chosen]
-    pair = Dataset(tiny.folder, tiny.manifest.model_copy(update={"tasks": tuple(kept)}))
+    pair = with_tasks(tiny, {task.index for task in (*tiny.train_tasks[:2], *tiny.test_tasks)})
     report = train_run(pair, tmp_path / "run", config=config_of(tiny), profile="quick", steps=5)
     assert report.step == 5
 
