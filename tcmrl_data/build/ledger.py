@@ -137,8 +137,8 @@ class Ledger:
                 raise StoreError(
                     f"{archive.path} has {archive.size} bytes, its worker wrote {published.entry.size}"
                 )
+        self._add(key)  # first: what Ctrl-C keeps from the table is not taken for missing and recorded twice
         self._record(published)
-        self._add(key)
         wait = max(SEAL_SECONDS, self._seal_seconds / SEAL_SHARE)
         if time.monotonic() - self._sealed > wait:
             self.seal()
@@ -155,8 +155,8 @@ class Ledger:
             if wait_until_visible(self._out / part_file(key), deadline=deadline):
                 published = self._read(key)
                 if published is not None:
-                    self._record(published)
                     self._add(key)
+                    self._record(published)
 
     def is_sealed(self) -> bool:
         """Whether the manifest on disk says all that is known here."""

@@ -74,7 +74,7 @@ class BuildPlan:
         """
         check_plan(
             tasks=len(self.tasks),
-            parts=len(self.tasks) * len(self.source.steps),
+            steps=len(self.source.steps),
             columns=max(self.environment.observation_dim, self.environment.action_dim),
             largest_task=max(len(task_line(task)) for task in self.tasks),
         )

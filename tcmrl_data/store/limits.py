@@ -8,6 +8,8 @@ from tcmrl_data.foundation.errors import BuildError
 
 MAX_PARTS = 1_000_000
 MAX_TASKS = 100_000
+MAX_STEPS = 2**14
+"""Snapshot steps of a run; the manifest and every part's record list them."""
 MAX_RUNS = 1_000
 MAX_PLATFORMS = 1_000
 
@@ -27,12 +29,12 @@ LINE_BYTES = 2**16
 PART_RECORD_BYTES = 2**21
 
 
-def check_plan(*, tasks: int, parts: int, columns: int, largest_task: int) -> None:
+def check_plan(*, tasks: int, steps: int, columns: int, largest_task: int) -> None:
     """Checks that a dataset will not become larger than readers allow.
 
     Args:
         tasks: number of tasks.
-        parts: number of parts.
+        steps: number of snapshot steps of every task.
         columns: width of observations or actions, whichever is larger.
         largest_task: bytes of the longest line of a task.
 
@@ -41,7 +43,8 @@ def check_plan(*, tasks: int, parts: int, columns: int, largest_task: int) -> No
     """
     for what, found, limit in (
         ("tasks", tasks, MAX_TASKS),
-        ("parts", parts, MAX_PARTS),
+        ("snapshot steps", steps, MAX_STEPS),
+        ("parts", tasks * steps, MAX_PARTS),
         ("columns of observations or actions", columns, MAX_COLUMNS),
         ("bytes for the parameters of one task", largest_task, LINE_BYTES),
     ):
