@@ -1,1 +1,1 @@
-"""A dataset on disk: arrays, records, layout."""
+"""A dataset on disk: archives, arrays, tables, manifest, records."""
