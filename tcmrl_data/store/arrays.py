@@ -1,4 +1,4 @@
-"""Arrays of a part: the only file that imports zarr or its codecs. Trajectories in, flat arrays out, and back.
+"""Arrays of a part: the only file that imports zarr or its codecs. Trajectories in, arrays out, and back.
 
 The arrays of a part are a Zarr v3 group in its archive. Steps of all episodes lie flat behind one another
 with `episode_offsets`; observations hold one row more per episode, so that row `offset[e] + e + t` is o_t of
