@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from tcmrl_data import Dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.disk import STAGING, lock_file, remove_abandoned
-from tcmrl_data.store.manifest import Manifest, part_folder, read_manifest
 
 MARK = "TCMRL_KILL_SWEEP"
 ORPHAN_SECONDS = 60.0
@@ -36,6 +36,7 @@ class Figures:
     builds: int = 0
     parts_lost: int = 0
     parts_duplicated: int = 0
+    findings: int = 0
     roots_that_differ: int = 0
     staging_left: int = 0
     orphans: int = 0
@@ -99,7 +100,7 @@ def kill_once(
 
 def build_under_fire(
     out: Path, arguments: Sequence[str], figures: Figures, dice: random.Random, *, kills: int, pause: float
-) -> Manifest:
+) -> Dataset:
     """Builds a dataset to its end, killing until the sweep has its number of kills."""
     mark = uuid.uuid4().hex
     while True:
@@ -110,21 +111,20 @@ def build_under_fire(
                 else:
                     process.wait()
         if process.returncode == 0:
-            return read_manifest(out)
+            return open_dataset(out)
 
 
-def compare(out: Path, manifest: Manifest, reference: Manifest, figures: Figures) -> None:
+def compare(dataset: Dataset, reference: Dataset, figures: Figures) -> None:
     """Adds to the figures what differs from the reference."""
-    expected = {(part.task, part.step): part.id for part in reference.parts}
-    found = [
-        (part.task, part.step) for part in manifest.parts if expected.get((part.task, part.step)) == part.id
-    ]
-    on_disk = len(list(out.glob("tasks/*/snapshots/step_*")))
+    out, expected = dataset.folder, {entry.key: entry.id for entry in reference.parts.entries()}
+    found = {entry.key: entry.id for entry in dataset.parts.entries()}
     figures.builds += 1
-    figures.parts_lost += sum(not (out / part_folder(*key) / "part.json").is_file() for key in expected)
-    figures.parts_lost += len(expected) - len(found)
-    figures.parts_duplicated += on_disk - len(expected)
-    figures.roots_that_differ += manifest.root != reference.root
+    figures.parts_lost += sum(not dataset.file_of(key).is_file() for key in expected)
+    figures.parts_lost += sum(found.get(key) != part for key, part in expected.items())
+    figures.parts_duplicated += len(list(out.rglob("*.zip"))) - len(expected)
+    figures.parts_duplicated += dataset.manifest.parts.lines - 1 - len(expected)
+    figures.roots_that_differ += dataset.manifest.root != reference.manifest.root
+    figures.findings += len(verify_dataset(out).findings)
     with lock_file(out / ".lock", "dataset"):
         remove_abandoned(out)
     figures.staging_left += len(list((out / STAGING).iterdir()))
@@ -138,8 +138,8 @@ def run_sweep(kills: int, *, pause: float, seed: int, arguments: Sequence[str]) 
         subprocess.run(command(reference, arguments), check=True)
         while figures.kills < kills:
             out = Path(folder) / "killed"
-            manifest = build_under_fire(out, arguments, figures, dice, kills=kills, pause=pause)
-            compare(out, manifest, read_manifest(reference), figures)
+            dataset = build_under_fire(out, arguments, figures, dice, kills=kills, pause=pause)
+            compare(dataset, open_dataset(reference), figures)
             shutil.rmtree(out)
     return figures
 

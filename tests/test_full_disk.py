@@ -83,7 +83,7 @@ def test_a_read_only_dataset_that_lacks_parts_is_refused_by_name(tiny_copy: Call
     )
     assert more.returncode == 2
     assert more.stderr.startswith(f"Error: {copy} cannot be written") and more.stderr.count("\n") == 1
-    shutil.rmtree(copy / "tasks" / "00003")
+    shutil.rmtree(copy / "parts" / "main" / "00003")
     damaged = run_mounted(read_only(copy), "repair", copy, "--quiet")
     assert damaged.returncode == 2
     assert damaged.stderr.startswith(f"Error: {copy} cannot be written") and damaged.stderr.count("\n") == 1

@@ -26,7 +26,7 @@ def older(tiny_copy: Callable[[], Path]) -> Path:
     file = tiny_copy() / "manifest.json"
     fields = json.loads(file.read_text())
     del fields["digest"]
-    for table in fields["recipe"]["training"].values():
+    for table in fields["runs"][0]["recipe"]["training"].values():
         del table["focal"]
     file.write_bytes(seal(fields))
     return file.parent
