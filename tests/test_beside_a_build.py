@@ -10,6 +10,8 @@ import pytest
 
 from tcmrl_data import Dataset, Recipe, build_status, open_dataset, verify_dataset
 from tcmrl_data.build import ledger
+from tcmrl_data.verification import verify
+from tcmrl_data.verification.scan import Scan, scan_dataset
 from tests.simulated_disk import PreparedParts
 
 RUNS = 20
@@ -70,3 +72,19 @@ def test_asking_for_the_status_never_makes_a_build_fail(
         for asker in askers:
             os.kill(asker, signal.SIGKILL)
             os.waitpid(asker, 0)
+
+
+def test_a_build_that_begins_and_ends_during_a_verification_gives_no_finding(
+    tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    parts, out = PreparedParts(tiny, tiny_recipe, [0, 3]), tmp_path / "data"
+    parts.build(out, monkeypatch, tasks=[0])
+
+    def build_and_scan(folder: Path) -> Scan:
+        """Builds after the manifest was read and before the files are listed."""
+        parts.build(out, monkeypatch)
+        return scan_dataset(folder)
+
+    monkeypatch.setattr(verify, "scan_dataset", build_and_scan)
+    report = verify_dataset(out)
+    assert (report.findings, report.parts) == ((), 3)
