@@ -16,6 +16,7 @@ from tests.namespace import has_only_loopback
 from tests.workers import MARK, ROOT
 
 sys.path.append(str(Path(__file__).parent / "doubles"))  # a distribution: methods as plug-ins
+sys.path.append(str(ROOT))  # for `benchmarks`, which makes datasets of many parts
 
 TASKS = [0, 3, 40, 60, 99]
 TINY = (

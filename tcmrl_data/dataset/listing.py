@@ -1,19 +1,20 @@
 """Which datasets lie below a folder."""
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.store.keys import PARTS
 from tcmrl_data.store.manifest import MANIFEST, Manifest, read_manifest
 
 
 def list_datasets(root: str | Path) -> list[dict[str, Any]]:
     """The datasets below a folder: name, tasks, parts, complete, root, path; unreadable ones with `error`."""
     rows: list[dict[str, Any]] = []
-    for file in sorted(Path(root).glob(f"**/{MANIFEST}")):
-        if STAGING in file.relative_to(root).parts:
-            continue  # parts on their way, such as those that a repair makes again
+    for file in sorted(_manifests(Path(root))):
         try:
             manifest = read_manifest(file)
         except ManifestError as error:
@@ -21,6 +22,16 @@ def list_datasets(root: str | Path) -> list[dict[str, Any]]:
             continue
         rows.append(dataset_row(manifest, file.parent))
     return rows
+
+
+def _manifests(root: Path) -> Iterator[Path]:
+    """The manifests below a folder."""
+    for folder, inner, files in os.walk(root):
+        is_dataset = MANIFEST in files
+        if is_dataset:
+            yield Path(folder, MANIFEST)
+        # in staging are parts on their way, such as those that a repair makes again; archives are many
+        inner[:] = [name for name in inner if name != STAGING and not (is_dataset and name == PARTS)]
 
 
 def dataset_row(manifest: Manifest, folder: Path) -> dict[str, Any]:

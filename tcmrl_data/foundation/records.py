@@ -15,6 +15,9 @@ from tcmrl_data.foundation.validation import first_problem
 HIDDEN_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Unicode categories of control, format and surrogate characters and of line separators."""
 
+SMALL_RECORD = 2**16
+"""Bytes of JSON up to which a record is validated once, whatever its errors cost; most parts' are 10 kB."""
+
 
 class Record(BaseModel):
     """A record of a dataset: frozen; unknown keys, type conversions and NaN are errors."""
@@ -82,7 +85,8 @@ def parse_record(kind: type[Kind], values: Any, file: object, *, version: int) -
     try:
         # Errors of model_validate_json copy the input many times. Errors of model_validate refer to it,
         # so a large invalid record fails here, in little memory.
-        kind.model_validate(_with_tuples(values))
+        if len(text) > SMALL_RECORD:
+            kind.model_validate(_with_tuples(values))
         return kind.model_validate_json(text)
     except ValidationError as error:
         raise ManifestError(f"{file}: {printable(first_problem(error))[:500]}") from None

@@ -64,7 +64,7 @@ class ArrayLayout:
     shape: tuple[int, ...]
     chunks: tuple[int, ...]
 
-    @property
+    @functools.cached_property
     def grid(self) -> tuple[int, ...]:
         """Number of chunks along each axis."""
         return tuple(-(-size // chunk) for size, chunk in zip(self.shape, self.chunks, strict=True))

@@ -258,8 +258,10 @@ def _columns_of(rows: Iterable[Sequence[Any]], runs: dict[str, int]) -> dict[str
     }
     for name in ("id", "sha256"):
         columns[name] = np.frombuffer(bytes.fromhex("".join(named.get(name, ()))), dtype="V32")
-    positions = [runs.setdefault(run, len(runs)) for run in named.get("run", ())]
-    columns["run"] = np.array(positions, dtype=np.int32)
+    names = named.get("run", ())
+    for run in dict.fromkeys(names):
+        runs.setdefault(run, len(runs))
+    columns["run"] = np.array([*map(runs.__getitem__, names)], dtype=np.int32)
     return columns
 
 
