@@ -1,9 +1,7 @@
-"""Forged datasets for all known attacks, with consistent digests, so that only the attack can be found."""
+"""Forged datasets for all known attacks; the marks of a forgery are consistent, see `forged_datasets.py`."""
 
 import json
 import os
-import pickle
-import shutil
 import socket
 import struct
 from collections.abc import Callable
@@ -12,117 +10,16 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from safetensors.numpy import load, save
 
-from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
-from tcmrl_data.store.manifest import MANIFEST, PartEntry, merkle_root, part_folder, seal
+from tcmrl_data.store.manifest import MANIFEST
+from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartEntry
+from tcmrl_data.store.task_table import TASKS
+from tests import forged_archives
+from tests.forged_datasets import OTHER, PART, Forge, Values, offsets, rle_frame, with_checksum
 
-TASKS, STEP = (0, 3), 150
-PART = part_folder(0, STEP)
-OTHER = part_folder(3, STEP)
 ESCAPE = "\x1b]0;owned\x07\x1b[2J"
-Stage = Literal["open", "read", "verify"]
-Values = dict[str, Any]
-
-
-class Forge:
-    """A dataset of two parts whose files and digests the tests forge.
-
-    Attributes:
-        folder: the dataset.
-        outside: a folder that nothing may read.
-        marker: a file that exists only if code of the dataset ran.
-    """
-
-    def __init__(self, folder: Path, outside: Path) -> None:
-        self.folder, self.outside, self.marker = folder, outside, outside.parent / "code-ran"
-        self.part = folder / PART
-
-    def write(self, name: str, data: bytes) -> None:
-        """Replaces a file of the part and its entry in the part's record."""
-        (self.part / name).write_bytes(data)
-        self.record(
-            lambda values: values["files"].update({name: {"size": len(data), "sha256": sha256(data)}})
-        )
-
-    def rename(self, name: str) -> None:
-        """Moves a file out of the part; the part's record still names it."""
-        (self.part / name).rename(self.outside / "taken")
-
-    def record(self, change: Callable[[Values], object], *, text: Callable[[str], str] = str) -> None:
-        """Changes `part.json`, its id and the manifest."""
-        file = self.part / "part.json"
-        values = json.loads(file.read_bytes())
-        change(values)
-        values["id"] = digest(values["identity"])
-        file.write_bytes(text(canonical_json(values).decode()).encode())
-        self.manifest(lambda manifest: self._name_part(manifest, values["id"], sha256(file.read_bytes())))
-
-    def manifest(self, change: Callable[[Values], object], *, root: bool = True) -> None:
-        """Changes `manifest.json` and updates its root."""
-        file = self.folder / MANIFEST
-        values = json.loads(file.read_bytes())
-        change(values)
-        values.pop("digest", None)
-        if root:
-            values["root"] = _root(values["parts"])
-        file.write_bytes(seal(values))
-
-    def text(self, old: bytes, new: bytes) -> None:
-        """Changes the manifest's bytes without updating its root."""
-        file = self.folder / MANIFEST
-        assert old in file.read_bytes()
-        file.write_bytes(file.read_bytes().replace(old, new, 1))
-
-    def zarr(self, array: str, **fields: Any) -> None:
-        """Changes an array's `zarr.json`."""
-        values = json.loads((self.part / array / "zarr.json").read_bytes()) | fields
-        self.write(f"{array}/zarr.json", json.dumps(values).encode())
-
-    def rows(self, num_rows: int) -> None:
-        """Sets the number of steps in every array and every record; chunks stay unchanged."""
-        arrays = json.loads((self.part / "part.json").read_bytes())["identity"]["arrays"]
-        for name, array in arrays.items():
-            if name != "episode_offsets":
-                shape = [num_rows + 6 * (name == "observations"), *array["shape"][1:]]
-                grid = {"name": "regular", "configuration": {"chunk_shape": shape}}
-                self.zarr(name, shape=shape, chunk_grid=grid)
-                self.record(lambda values, n=name, s=shape: values["identity"]["arrays"][n].update(shape=s))
-
-    def policy(self, **fields: Any) -> None:
-        """Changes `policy.json`."""
-        values = json.loads((self.part / "policy.json").read_bytes()) | fields
-        self.write("policy.json", canonical_json(values))
-
-    def weights(self, change: Callable[[dict[str, Any]], object]) -> None:
-        """Changes the tensors."""
-        tensors = {k: v.copy() for k, v in load((self.part / "policy.safetensors").read_bytes()).items()}
-        change(tensors)
-        self.write("policy.safetensors", save(tensors))
-
-    def header(self, change: Callable[[Values], object]) -> None:
-        """Changes the header of the safetensors file; its data stay unchanged."""
-        data = (self.part / "policy.safetensors").read_bytes()
-        end = 8 + int.from_bytes(data[:8], "little")
-        values = json.loads(data[8:end])
-        change(values)
-        text = json.dumps(values).encode()
-        self.write("policy.safetensors", struct.pack("<Q", len(text)) + text + data[end:])
-
-    def payload(self) -> bytes:
-        """A pickle that writes the marker file when it is read."""
-        marker = str(self.marker)
-
-        class Bomb:
-            def __reduce__(self) -> tuple[Any, ...]:
-                return open, (marker, "w")
-
-        return pickle.dumps(Bomb())
-
-    @staticmethod
-    def _name_part(manifest: Values, part_id: str, sealed: str) -> None:
-        entry = next(part for part in manifest["parts"] if part["task"] == TASKS[0])
-        entry |= {"id": part_id, "sha256": sealed}
+Stage = Literal["open", "tables", "read", "verify"]
+Damage = Callable[[Forge], object]
 
 
 @dataclass(frozen=True)
@@ -131,106 +28,110 @@ class Case:
 
     Attributes:
         damage: makes it.
-        stage: the first stage that must refuse: opening, reading arrays and policy, or deep verification.
         file: end of the path that the error and a finding must name.
-        words: what the error must say, at least the field.
+        words: what error and finding must say, at least the field.
+        stage: the first stage that must refuse: the manifest, the tables, reading arrays and policy, or
+            deep verification.
     """
 
     name: str
-    damage: Callable[[Forge], object]
+    damage: Damage
     file: str
-    words: str
-    stage: Stage = "open"
+    words: tuple[str, ...]
+    stage: Stage
 
 
-def base(tiny: Path, folder: Path) -> Path:
-    """Two parts of the tiny dataset as a complete dataset."""
-    for task in TASKS:
-        shutil.copytree(tiny / part_folder(task, STEP), folder / part_folder(task, STEP))
-        for parent in Path(part_folder(task, STEP)).parents:
-            shutil.copy(tiny / parent / "zarr.json", folder / parent / "zarr.json")
-    values = json.loads((tiny / MANIFEST).read_bytes())
-    values.pop("digest")
-    values |= {"steps": [STEP], "complete": True}
-    values["tasks"] = [task for task in values["tasks"] if task["index"] in TASKS]
-    values["parts"] = [part for part in values["parts"] if part["task"] in TASKS and part["step"] == STEP]
-    values["root"] = _root(values["parts"])
-    values["references"] = {
-        str(task): record["references"] | {"behavior": record["statistics"]["mean"]}
-        for task in TASKS
-        for record in [json.loads((folder / part_folder(task, STEP) / "part.json").read_bytes())]
-    }
-    (folder / MANIFEST).write_bytes(seal(values))
-    return folder
+def _manifest(name: str, damage: Damage, words: str, stage: Stage = "open") -> Case:
+    return Case(name, damage, MANIFEST, (words,), stage)
 
 
-def rle_frame(num_bytes: int, *, declared: int | None = None) -> bytes:
-    """A zstd frame of zeros in run-length blocks of 128 KiB, and the checksum that Zarr puts behind it."""
-    blocks = []
-    for start in range(0, num_bytes, 2**17):
-        size = min(2**17, num_bytes - start)
-        is_last = start + size == num_bytes
-        blocks.append(struct.pack("<I", is_last | 1 << 1 | size << 3)[:3] + b"\0")
-    size_field = struct.pack("<Q", num_bytes if declared is None else declared)
-    return with_checksum(b"\x28\xb5\x2f\xfd\xe0" + size_field + b"".join(blocks))
+def _tasks(name: str, damage: Damage, words: str, stage: Stage = "tables") -> Case:
+    return Case(f"tasks: {name}", damage, TASKS, (words,), stage)
 
 
-def with_checksum(data: bytes) -> bytes:
-    """Bytes with the CRC-32C that Zarr's codec expects."""
-    crc = 0xFFFFFFFF
-    for byte in data:
-        crc ^= byte
-        for _ in range(8):
-            crc = crc >> 1 ^ (0x82F63B78 if crc & 1 else 0)
-    return data + struct.pack("<I", crc ^ 0xFFFFFFFF)
+def _parts(name: str, damage: Damage, words: str, stage: Stage = "tables") -> Case:
+    return Case(f"parts: {name}", damage, PARTS_TABLE, (words,), stage)
 
 
-def _root(parts: list[Values]) -> str:
-    zeros = "0" * 64
-    known = [
-        part for part in parts if isinstance(part.get("task"), int) and isinstance(part.get("step"), int)
-    ]
-    return merkle_root(
-        PartEntry.model_construct(task=p["task"], step=p["step"], id=p["id"], sha256=zeros) for p in known
-    )
+def _part(name: str, damage: Damage, member: str, words: str, stage: Stage = "read") -> Case:
+    """A forgery within the archive; error and finding must name the member too."""
+    return Case(name, damage, PART, (member, words), stage)
 
 
-def _first_task(index: Any) -> Callable[[Forge], object]:
-    return lambda forge: forge.manifest(lambda values: values["tasks"][0].update(index=index))
+def _file(name: str, damage: Damage, file: str, words: str, stage: Stage = "verify") -> Case:
+    return Case(name, damage, file, (words,), stage)
 
 
-def _field(**fields: Any) -> Callable[[Forge], object]:
+def _field(**fields: Any) -> Damage:
     return lambda forge: forge.manifest(lambda values: values.update(fields))
 
 
-def _name(name: str) -> Callable[[Forge], object]:
+def _recipe(change: Callable[[Values], object]) -> Damage:
+    return lambda forge: forge.manifest(lambda values: change(values["runs"][0]["recipe"]))
+
+
+def _run(**fields: Any) -> Damage:
+    return lambda forge: forge.manifest(lambda values: values["runs"][0].update(fields))
+
+
+def _name(name: str) -> Damage:
     return lambda forge: forge.manifest(
-        lambda values: (values.update(name=name), values["recipe"]["environment"].update(name=name))
+        lambda values: (
+            values.update(name=name),
+            values["runs"][0]["recipe"]["environment"].update(name=name),
+        )
     )
 
 
-def _array_name(name: str) -> Callable[[Forge], object]:
-    """An array of another name, with its files where the file system allows the name."""
+def _more_tasks(forge: Forge) -> None:
+    forge.manifest(lambda values: values["tasks"].update(lines=90_000))
+
+
+def _raw(table: str, change: Callable[[bytes], bytes]) -> Damage:
+    """Other bytes in a table, which the manifest still seals as they were."""
 
     def damage(forge: Forge) -> None:
-        forge.record(
-            lambda values: values["identity"]["arrays"].update(
-                {name: values["identity"]["arrays"]["rewards"]}
-            )
-        )
+        file = forge.folder / table
+        file.write_bytes(change(file.read_bytes()))
 
     return damage
 
 
-def _identity(change: Callable[[Values], object]) -> Callable[[Forge], object]:
+def _sealed(table: str, change: Callable[[bytes], bytes], **lies: int) -> Damage:
+    """Other bytes in a table, which the manifest seals."""
+    return lambda forge: forge.table(table, change((forge.folder / table).read_bytes()), **lies)
+
+
+def _task(**fields: Any) -> Damage:
+    return lambda forge: forge.rows(TASKS, lambda rows: rows[0].update(fields))
+
+
+def _parameters(**fields: Any) -> Damage:
+    return lambda forge: forge.rows(TASKS, lambda rows: rows[0]["parameters"].update(fields))
+
+
+def _cell(column: str, value: Any, row: int = 0) -> Damage:
+    return lambda forge: forge.cell(row, column, value)
+
+
+def _array_name(name: str) -> Damage:
+    """A further array of this name in the record."""
+    return _identity(lambda values: values["arrays"].update({name: values["arrays"]["rewards"]}))
+
+
+def _identity(change: Callable[[Values], object]) -> Damage:
     return lambda forge: forge.record(lambda values: change(values["identity"]))
 
 
-def _zarr(array: str = "rewards", **fields: Any) -> Callable[[Forge], object]:
+def _zarr(array: str = "rewards", **fields: Any) -> Damage:
     return lambda forge: forge.zarr(array, **fields)
 
 
-def _link(name: str) -> Callable[[Forge], object]:
+def _chunk(data: bytes) -> Damage:
+    return lambda forge: forge.write("rewards/c/0", data)
+
+
+def _link(name: str) -> Damage:
     """A symbolic link to the original file, which is moved outside the dataset."""
 
     def damage(forge: Forge) -> None:
@@ -241,12 +142,20 @@ def _link(name: str) -> Callable[[Forge], object]:
     return damage
 
 
-def _special(name: str, make: Callable[[Path], object]) -> Callable[[Forge], object]:
+def _special(name: str, make: Callable[[Path], object]) -> Damage:
     def damage(forge: Forge) -> None:
         (forge.folder / name).unlink()
         make(forge.folder / name)
 
     return damage
+
+
+def _device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def _two_names(name: str) -> Damage:
+    return lambda forge: os.link(forge.folder / name, forge.outside / "same")
 
 
 def _socket(path: Path) -> None:
@@ -259,23 +168,13 @@ def _socket(path: Path) -> None:
         os.chdir(here)
 
 
-def _v2(forge: Forge) -> None:
-    (forge.part / "rewards" / "zarr.json").unlink()
-    (forge.part / "rewards" / ".zarray").write_text('{"zarr_format":2,"dtype":"|O","shape":[120]}')
-
-
-def _chunk(data: bytes) -> Callable[[Forge], object]:
-    return lambda forge: forge.write("rewards/c/0", data)
-
-
 def _bomb(forge: Forge) -> None:
     """Every array claims 2**26 steps; one array really decodes to that many."""
-    forge.rows(2**26)
+    forge.lengthen(2**26)
     forge.write("terminated/c/0", rle_frame(2**26))
 
 
 def _many_arrays(forge: Forge) -> None:
-    """Arrays whose single sizes are below the limit and whose sum is far above it."""
     forge.record(
         lambda values: values["identity"]["arrays"].update(
             {f"extra{i}": values["identity"]["arrays"]["rewards"] for i in range(40)}
@@ -284,547 +183,644 @@ def _many_arrays(forge: Forge) -> None:
 
 
 def _swap(forge: Forge) -> None:
-    left, right = (forge.folder / place / "part.json" for place in (PART, OTHER))
-    left_data, right_data = left.read_bytes(), right.read_bytes()
-    left.write_bytes(right_data)
-    right.write_bytes(left_data)
-    forge.manifest(
-        lambda values: [
-            part.update(id=json.loads(data)["id"], sha256=sha256(data))
-            for part, data in zip(values["parts"], (right_data, left_data), strict=True)
-        ]
-    )
+    """Two parts at each other's places, of which the table tells the truth."""
+    files = [forge.folder / PART, forge.folder / OTHER]
+    contents = [file.read_bytes() for file in files]
+    for file, content in zip(files, reversed(contents), strict=True):
+        file.write_bytes(content)
+
+    def change(rows: list[Any]) -> None:
+        for column in ("id", "sha256", "size"):
+            place = PartEntry._fields.index(column)
+            rows[1][place], rows[2][place] = rows[2][place], rows[1][place]
+
+    forge.rows(PARTS_TABLE, change)
 
 
 def _nan_array(forge: Forge) -> None:
-    """NaN rewards with consistent digests, as if a rollout had returned them."""
-    from tcmrl_data.store.arrays import array_digests, encode_arrays, read_arrays
-
-    rewards = read_arrays(forge.part, ["rewards"])["rewards"].copy()
-    rewards[7] = np.nan
-    forge.write("rewards/c/0", encode_arrays({"rewards": rewards})["rewards/c/0"])
-    forge.record(lambda values: values["identity"]["arrays"].update(array_digests({"rewards": rewards})))
+    """NaN rewards with consistent digests."""
+    forge.values("rewards", lambda array: array.__setitem__(7, np.nan))
 
 
-def _offsets(values: list[int]) -> Callable[[Forge], object]:
-    def damage(forge: Forge) -> None:
-        from tcmrl_data.store.arrays import array_digests, encode_arrays
-
-        arrays = {"episode_offsets": np.array(values, dtype=np.int64)}
-        forge.write("episode_offsets/c/0", encode_arrays(arrays)["episode_offsets/c/0"])
-        forge.record(lambda record: record["identity"]["arrays"].update(array_digests(arrays)))
-
-    return damage
+def _offsets(values: list[int]) -> Damage:
+    return lambda forge: forge.encode(offsets(values))
 
 
-def _manifest_file(data: bytes) -> Callable[[Forge], object]:
+def _manifest_file(data: bytes) -> Damage:
     return lambda forge: (forge.folder / MANIFEST).write_bytes(data)
 
 
 def _repeated_header(forge: Forge) -> None:
-    size = (forge.part / "policy.safetensors").stat().st_size
+    size = len(forge.read("policy.safetensors"))
     forge.write("policy.safetensors", struct.pack("<Q", 2**62) + b"{" * (size - 8))
 
 
 BIG = 2**63 - 1
 CODECS = [{"name": "bytes", "configuration": {"endian": "little"}}]
 SHARDS = {"name": "sharding_indexed", "configuration": {"chunk_shape": [1], "codecs": CODECS}}
+SB3_ZIP = b"PK\x03\x04" + bytes(26) + b"data" + bytes(4096)
 
 MANIFESTS = [
-    Case("empty file", _manifest_file(b""), MANIFEST, "not a manifest"),
-    Case("NaN", lambda f: f.text(b'"seed":0', b'"seed":NaN'), MANIFEST, "NaN is not allowed"),
-    Case("infinity", lambda f: f.text(b'"seed":0', b'"seed":-Infinity'), MANIFEST, "-Infinity is not"),
-    Case("1e999", lambda f: f.text(b'"seed":0', b'"seed":1e999'), MANIFEST, "too large"),
-    Case("5000 digits", lambda f: f.text(b'"seed":0', b'"seed":' + b"9" * 5000), MANIFEST, "digits"),
-    Case("duplicate key", lambda f: f.text(b'"seed":0', b'"seed":0,"seed":1'), MANIFEST, "key 'seed'"),
-    Case(
-        "duplicate escaped key",
-        lambda f: f.text(b'"seed":0', b'"seed":0,"\\u0073eed":1'),
-        MANIFEST,
-        "duplicate key 'seed'",
+    _manifest("empty file", _manifest_file(b""), "not a manifest"),
+    _manifest("NaN", lambda f: f.text(b'"seed":0', b'"seed":NaN'), "NaN is not allowed"),
+    _manifest("infinity", lambda f: f.text(b'"seed":0', b'"seed":-Infinity'), "-Infinity is not"),
+    _manifest("1e999", lambda f: f.text(b'"seed":0', b'"seed":1e999'), "too large"),
+    _manifest("5000 digits", lambda f: f.text(b'"seed":0', b'"seed":' + b"9" * 5000), "digits"),
+    _manifest("duplicate key", lambda f: f.text(b'"seed":0', b'"seed":0,"seed":1'), "key 'seed'"),
+    _manifest(
+        "duplicate escaped key", lambda f: f.text(b'"seed":0', b'"seed":0,"\\u0073eed":1'), "key 'seed'"
     ),
-    Case("no UTF-8", lambda f: f.text(b'"seed":0', b'"seed":"\xff"'), MANIFEST, "utf-8"),
-    Case("byte order mark", lambda f: f.text(b"{", b"\xef\xbb\xbf{"), MANIFEST, "not a manifest"),
-    Case("surrogate", lambda f: f.text(b'"seed":0', b'"seed":"\\ud800"'), MANIFEST, "seed holds control"),
-    Case("extreme depth", _manifest_file(b"[" * 10**5), MANIFEST, "nested deeper"),
-    Case("extreme size", _manifest_file(b" " * (20 * 2**20)), MANIFEST, "bytes"),
-    Case("too many values", _manifest_file(b"[" + b"[]," * 200_000 + b"[]]"), MANIFEST, "values"),
-    Case(
-        "many values",
-        _manifest_file(b'{"schema_version":1,"x":[' + b"[]," * 60_000 + b"0]}"),
-        MANIFEST,
-        "digest",
+    _manifest("no UTF-8", lambda f: f.text(b'"seed":0', b'"seed":"\xff"'), "utf-8"),
+    _manifest("byte order mark", lambda f: f.text(b"{", b"\xef\xbb\xbf{"), "not a manifest"),
+    _manifest("surrogate", lambda f: f.text(b'"seed":0', b'"seed":"\\ud800"'), "seed holds control"),
+    _manifest("extreme depth", _manifest_file(b"[" * 10**5), "nested deeper"),
+    _manifest("extreme size", _manifest_file(b" " * (20 * 2**20)), "bytes"),
+    _manifest("too many values", _manifest_file(b"[" + b"[]," * 200_000 + b"[]]"), "values"),
+    _manifest(
+        "many values", _manifest_file(b'{"schema_version":2,"x":[' + b"[]," * 60_000 + b"0]}"), "digest"
     ),
-    Case(
-        "40000 bad parts", lambda f: f.text(b'"parts":[', b'"parts":[' + b"{}," * 40_000), MANIFEST, "parts.0"
+    _manifest("40000 bad runs", lambda f: f.text(b'"runs":[', b'"runs":[' + b"{}," * 40_000), "runs"),
+    _manifest("900 bad runs", lambda f: f.text(b'"runs":[', b'"runs":[' + b"{}," * 900), "runs.0"),
+    _manifest(
+        "two runs of one name", lambda f: f.manifest(lambda v: v["runs"].append(v["runs"][0])), "names"
     ),
-    Case(
-        "40000 bad tasks", lambda f: f.text(b'"tasks":[', b'"tasks":[' + b"{}," * 40_000), MANIFEST, "tasks.0"
-    ),
-    Case(
-        "1900 bad references",
-        lambda f: f.manifest(lambda v: v["references"].update({str(i): {} for i in range(1900)})),
-        MANIFEST,
-        "references.",
-    ),
-    Case(
-        "recipe of lists",
-        lambda f: f.manifest(lambda v: v.update(recipe={"x": [[]] * 60_000})),
-        MANIFEST,
-        "recipe.",
-    ),
-    Case("a list", _manifest_file(b"[1]"), MANIFEST, "schema_version"),
-    Case("edited", lambda f: f.text(b'"seed":0', b'"seed":1'), MANIFEST, "digest"),
-    Case("another version", _field(schema_version=2), MANIFEST, "schema_version 2"),
-    Case("a flag as version", _field(schema_version=True), MANIFEST, "schema_version True"),
-    Case("a text as version", _field(schema_version="1" * 5000), MANIFEST, "schema_version '1111"),
-    Case("unknown key", _field(surprise=1), MANIFEST, "surprise"),
-    Case("unknown key with escapes", _field(**{ESCAPE: 1}), MANIFEST, "control characters"),
-    Case("a flag as seed", _field(seed=True), MANIFEST, "seed"),
-    Case("a float as seed", _field(seed=0.0), MANIFEST, "seed"),
-    Case("a text as parts", _field(complete="yes"), MANIFEST, "complete"),
-    Case("null tasks", _field(tasks=None), MANIFEST, "tasks"),
-    Case("wrong root", lambda f: f.manifest(lambda v: v.update(root="0" * 64), root=False), MANIFEST, "root"),
-    Case("name climbs", _name("../../etc"), MANIFEST, "name"),
-    Case("name absolute", _name("/etc/passwd\x00"), MANIFEST, "name"),
-    Case("name drive", _name("C:\\x"), MANIFEST, "name"),
-    Case("name UNC", _name("\\\\server\\share"), MANIFEST, "name"),
-    Case("name NUL", _name("point\0robot"), MANIFEST, "name"),
-    Case("name newline", _name("point-robot\n"), MANIFEST, "name"),
-    Case("name escapes", _name(f"point{ESCAPE}"), MANIFEST, "name"),
-    Case("name 5000", _name("a" * 5000), MANIFEST, "name"),
-    Case("name case", _name("Point-Robot"), MANIFEST, "name"),
-    Case("name lookalike", _name("pοint-rοbοt"), MANIFEST, "name"),
-    Case("name unknown", _name("no-such-environment"), MANIFEST, "no-such-environment", "verify"),
-    Case(
+    _manifest("no run", _field(runs=[]), "runs"),
+    _manifest("no recipe", _run(recipe=None), "recipe"),
+    _manifest("run climbs", _run(name="../../etc"), "runs.0.name"),
+    _manifest("run newline", _run(name="main\n"), "runs.0.name"),
+    _manifest("run of another kind", _run(kind="stolen"), "runs.0.kind"),
+    _manifest("recipe of lists", _run(recipe={"x": [[]] * 60_000}), "recipe."),
+    _manifest("a list", _manifest_file(b"[1]"), "schema_version"),
+    _manifest("edited", lambda f: f.text(b'"seed":0', b'"seed":1'), "digest"),
+    _manifest("spaces", lambda f: f.text(b'"seed":0', b'"seed": 0'), "digest"),
+    _manifest("an earlier version", _field(schema_version=1, name=ESCAPE, seed=ESCAPE), "schema_version 1"),
+    _manifest("another version", _field(schema_version=3), "schema_version 3"),
+    _manifest("a flag as version", _field(schema_version=True), "schema_version True"),
+    _manifest("a text as version", _field(schema_version="1" * 5000), "schema_version '1111"),
+    _manifest("unknown key", _field(surprise=1), "surprise"),
+    _manifest("unknown key with escapes", _field(**{ESCAPE: 1}), "control characters"),
+    _manifest("label escapes", _field(label=ESCAPE), "label holds control"),
+    _manifest("label of 10,000", _field(label="a" * 10_000), "label"),
+    _manifest("a flag as seed", _run(seed=True), "seed"),
+    _manifest("a float as seed", _run(seed=0.0), "seed"),
+    _manifest("a text as flag", _field(complete="yes"), "complete"),
+    _manifest("null tasks", _field(tasks=None), "tasks"),
+    _manifest("name climbs", _name("../../etc"), "name"),
+    _manifest("name absolute", _name("/etc/passwd\x00"), "name"),
+    _manifest("name drive", _name("C:\\x"), "name"),
+    _manifest("name UNC", _name("\\\\server\\share"), "name"),
+    _manifest("name NUL", _name("point\0robot"), "name"),
+    _manifest("name newline", _name("point-robot\n"), "name"),
+    _manifest("name escapes", _name(f"point{ESCAPE}"), "name"),
+    _manifest("name 5000", _name("a" * 5000), "name"),
+    _manifest("name case", _name("Point-Robot"), "name"),
+    _manifest("name lookalike", _name("pοint-rοbοt"), "name"),
+    _manifest("no source", _recipe(lambda v: v["behavior"].pop("source")), "source"),
+    _manifest(
         "other environment",
-        lambda f: f.manifest(lambda v: v["recipe"]["environment"].update(name="point-robot-wind")),
-        MANIFEST,
+        _recipe(lambda v: v["environment"].update(name="point-robot-wind")),
         "recipe.environment.name",
     ),
-    Case("task -1", _first_task(-1), MANIFEST, "tasks.0.index"),
-    Case("task 2**70", _first_task(2**70), MANIFEST, "tasks.0.index"),
-    Case("task as path", _first_task("../7"), MANIFEST, "tasks.0.index"),
-    Case("task as float", _first_task(0.0), MANIFEST, "tasks.0.index"),
-    Case(
-        "task twice", lambda f: f.manifest(lambda v: v["tasks"].append(v["tasks"][0])), MANIFEST, "each once"
+    _manifest(
+        "description escapes", _recipe(lambda v: v["about"].update(description=f"x{ESCAPE}")), "description"
     ),
-    Case(
-        "part twice", lambda f: f.manifest(lambda v: v["parts"].append(v["parts"][1])), MANIFEST, "each once"
+    _manifest(
+        "platform escapes",
+        lambda f: f.manifest(lambda v: v["platforms"][0].update(cpu=ESCAPE)),
+        "platforms.0.cpu",
     ),
-    Case("part missing", lambda f: f.manifest(lambda v: v["parts"].pop()), MANIFEST, "complete"),
-    Case(
-        "part of no task",
-        lambda f: f.manifest(lambda v: v["parts"][1].update(task=99)),
-        MANIFEST,
-        "parts names a task",
+    _manifest(
+        "platform of lists",
+        lambda f: f.manifest(lambda v: v["platforms"][0].update(packages=[[]] * 60_000)),
+        "platforms.0.packages",
     ),
-    Case(
-        "step 4000 digits",
-        lambda f: f.manifest(lambda v: v["parts"][0].update(step=10**3999)),
-        MANIFEST,
-        "step",
+    _manifest(
+        "2,000 platforms",
+        lambda f: f.manifest(lambda v: v.update(platforms=v["platforms"] * 2000)),
+        "platforms",
     ),
-    Case(
-        "id newline", lambda f: f.manifest(lambda v: v["parts"][0].update(id="a" * 64 + "\n")), MANIFEST, "id"
+    _manifest("dropped twice", _field(dropped=[3, 3]), "dropped"),
+    _manifest("dropped below zero", _field(dropped=[-1]), "dropped"),
+    _manifest("dropped beyond all", _field(dropped=[2**70]), "dropped"),
+    _manifest("more dropped than there are", _field(dropped=[0, 1, 3]), "at most"),
+    _manifest("steps in disorder", _run(steps=[150, 0]), "steps"),
+    _manifest("step below zero", _run(steps=[-150]), "steps"),
+    _manifest("step of 4000 digits", _run(steps=[10**3999]), "steps"),
+    _manifest(
+        "two million parts", lambda f: (_run(steps=list(range(30)))(f), _more_tasks(f)), "the runs call for"
     ),
-    Case(
-        "id climbs",
-        lambda f: f.manifest(lambda v: v["parts"][0].update(id="../" * 20)),
-        MANIFEST,
-        "parts.0.id",
+    _manifest("root newline", _field(root="a" * 64 + "\n"), "root"),
+    _manifest(
+        "totals below zero", lambda f: f.manifest(lambda v: v["totals"].update(steps=-1)), "totals.steps"
     ),
-    Case(
-        "oracle text",
-        lambda f: f.manifest(lambda v: v["references"]["0"].update(oracle="high")),
-        MANIFEST,
-        "references.0.oracle",
+    _manifest(
+        "totals beyond all", lambda f: f.manifest(lambda v: v["totals"].update(bytes=2**70)), "totals.bytes"
     ),
-    Case(
-        "references",
-        lambda f: f.manifest(lambda v: v["references"]["0"].update(oracle=1e9)),
-        MANIFEST,
-        "references",
+    _manifest(
+        "a seal below zero", lambda f: f.manifest(lambda v: v["parts"].update(bytes=-1)), "parts.bytes"
+    ),
+    _manifest(
+        "a seal beyond all", lambda f: f.manifest(lambda v: v["tasks"].update(bytes=2**62)), "tasks.bytes"
+    ),
+    _manifest("a billion parts", lambda f: f.manifest(lambda v: v["parts"].update(lines=10**9)), "parts"),
+    _manifest("a million tasks", lambda f: f.manifest(lambda v: v["tasks"].update(lines=10**6)), "tasks"),
+    _manifest(
+        "total of parts",
+        lambda f: f.manifest(lambda v: v["totals"].update(parts=3)),
+        "totals.parts",
         "verify",
     ),
-    Case(
-        "no source", lambda f: f.manifest(lambda v: v["recipe"]["behavior"].pop("source")), MANIFEST, "source"
+    _manifest(
+        "total of steps",
+        lambda f: f.manifest(lambda v: v["totals"].update(steps=1)),
+        "totals.steps",
+        "verify",
     ),
-    Case(
-        "description escapes",
-        lambda f: f.manifest(lambda v: v["recipe"]["about"].update(description=f"x{ESCAPE}")),
-        MANIFEST,
-        "recipe.about.description",
+    _manifest(
+        "total of bytes",
+        lambda f: f.manifest(lambda v: v["totals"].update(bytes=1)),
+        "totals.bytes",
+        "verify",
     ),
-    Case(
-        "parameter escapes",
-        lambda f: f.manifest(lambda v: v["tasks"][0]["parameters"].update({"\x9b2J": 1})),
-        MANIFEST,
-        "tasks.0.parameters",
-    ),
-    Case(
-        "parameter turns text",
-        lambda f: f.manifest(lambda v: v["tasks"][0]["parameters"].update(goal="\u202ekcatta")),
-        MANIFEST,
-        "tasks.0.parameters.goal",
-    ),
-    Case(
-        "parameters edited",
-        lambda f: f.manifest(lambda v: v["tasks"][0]["parameters"].update(goal=[0.0, 2.0])),
-        MANIFEST,
+    _manifest("complete", _field(complete=False), "complete", "verify"),
+    Case("a task dropped that is there", _field(dropped=[3]), "", ("root",), "tables"),
+    Case("wrong root", _field(root="0" * 64), "", ("root",), "tables"),
+    _manifest("a part too few", lambda f: f.rows(PARTS_TABLE, lambda r: r.pop()), "complete", "verify"),
+    _manifest("a task dropped that is none", _field(dropped=[7]), "dropped names", "verify"),
+]
+
+TASK_TABLES = [
+    _tasks("missing", lambda f: (f.folder / TASKS).unlink(), "missing"),
+    _tasks("linked", _link(TASKS), "a link"),
+    _tasks("linked to a device", _special(TASKS, _device), "a link"),
+    _tasks("of two names", _two_names(TASKS), "hard links"),
+    _tasks("a FIFO", _special(TASKS, os.mkfifo), "a FIFO"),
+    _tasks("a socket", _special(TASKS, _socket), "a socket"),
+    _tasks("a folder", _special(TASKS, Path.mkdir), "a folder"),
+    _tasks("truncated", _raw(TASKS, lambda data: data[:-1]), "manifest seals"),
+    _tasks("empty", _raw(TASKS, lambda data: b""), "manifest seals"),
+    _tasks("longer", _raw(TASKS, lambda data: data + data), "does not seal", "verify"),
+    _tasks("no newline at the end", _sealed(TASKS, lambda data: data[:-1]), ""),
+    _tasks("lines lie", _sealed(TASKS, lambda data: data, lines=3), "manifest seals"),
+    _tasks("bytes lie", _sealed(TASKS, lambda data: data, bytes=2**30), "manifest seals"),
+    _tasks("two lines in one", _sealed(TASKS, lambda data: data.replace(b"\n", b",", 1)), ""),
+    _tasks("duplicate key", _sealed(TASKS, lambda data: data.replace(b"{", b'{"index":0,', 1)), "canonical"),
+    _tasks("spaces", _sealed(TASKS, lambda data: data.replace(b":", b": ", 1)), "canonical"),
+    _tasks("no UTF-8", _sealed(TASKS, lambda data: data.replace(b"goal", b"\xff", 1)), ""),
+    _tasks("NaN", _sealed(TASKS, lambda data: data.replace(b"1.0", b"NaN", 1)), ""),
+    _tasks("1e999", _sealed(TASKS, lambda data: data.replace(b"1.0", b"1e999", 1)), ""),
+    _tasks("5000 digits", _sealed(TASKS, lambda data: data.replace(b"1.0", b"9" * 5000, 1)), ""),
+    _tasks("surrogate", _sealed(TASKS, lambda data: data.replace(b"goal", b"\\ud800", 1)), ""),
+    _tasks("deep", _sealed(TASKS, lambda data: data.replace(b"1.0", b"[" * 10**5, 1)), ""),
+    _tasks(
+        "deep and closed",
+        _parameters(goal=json.loads("[" * 150 + "]" * 150)),
         "parameters of task 0",
         "verify",
     ),
-    Case(
-        "split edited",
-        lambda f: f.manifest(lambda v: v["tasks"][1].update(split="train")),
-        MANIFEST,
-        "split of task 3",
-        "verify",
-    ),
-    Case(
+    _tasks("a huge line", _sealed(TASKS, lambda data: b"x" * 2**22 + b"\n"), "bytes"),
+    _tasks("a long line", _parameters(goal="a" * 2**17), "bytes"),
+    _tasks("a million commas", _sealed(TASKS, lambda data: b"," * 10**6 + b"\n"), ""),
+    _tasks("200,000 lists", _sealed(TASKS, lambda data: b"[" + b"[]," * 200_000 + b"[]]\n"), ""),
+    _tasks("40,000 bad lines", _sealed(TASKS, lambda data: b"{}\n" * 40_000), "index"),
+    _tasks("40,000 lists", _sealed(TASKS, lambda data: b"[]\n" * 40_000), ""),
+    _tasks("index -1", _task(index=-1), "index"),
+    _tasks("index 2**70", _task(index=2**70), "index"),
+    _tasks("index as path", _task(index="../7"), "index"),
+    _tasks("index as float", _task(index=0.0), "index"),
+    _tasks("index as flag", _task(index=True), "index"),
+    _tasks("split unknown", _task(split="both"), "split"),
+    _tasks("unknown key", _task(surprise=1), "surprise"),
+    _tasks("parameters a list", _task(parameters=[]), "parameters"),
+    _tasks("a task twice", lambda f: f.rows(TASKS, lambda rows: rows.append(rows[0])), "twice"),
+    _tasks("parameter escapes", _parameters(**{"\x9b2J": 1}), "control characters"),
+    _tasks("parameter escapes as text", _parameters(goal=ESCAPE), "goal holds control"),
+    _tasks("parameter turns text", _parameters(goal="\u202ekcatta"), "goal holds control"),
+    _tasks("parameter deletes", _parameters(goal="\x7f"), "goal holds control"),
+    _tasks("parameters edited", _parameters(goal=[0.0, 2.0]), "parameters of task 0", "verify"),
+    _tasks("split edited", _task(split="test"), "split of task 0", "verify"),
+    _tasks(
         "trillion tasks",
-        lambda f: f.manifest(lambda v: v["recipe"]["environment"].update(tasks=10**12)),
-        MANIFEST,
-        "recipe.environment.tasks",
+        _recipe(lambda v: v["environment"].update(tasks=10**12)),
+        "environment.tasks",
         "verify",
     ),
-    Case(
-        "billion lanes",
-        lambda f: f.manifest(lambda v: v["recipe"]["rollouts"].update(lanes=10**9, episodes=10**9)),
-        "part.json",
-        "identity.settings",
-        "verify",
-    ),
-    Case(
+    _tasks("environment unknown", _name("no-such-environment"), "no-such-environment", "verify"),
+    _tasks(
         "unknown setting",
-        lambda f: f.manifest(lambda v: v["recipe"]["environment"].update(plugin="evil.py")),
-        MANIFEST,
+        _recipe(lambda v: v["environment"].update(plugin="evil.py")),
         "recipe.environment",
         "verify",
     ),
 ]
 
+PART_TABLES = [
+    _parts("missing", lambda f: (f.folder / PARTS_TABLE).unlink(), "missing"),
+    _parts("linked", _link(PARTS_TABLE), "a link"),
+    _parts("linked to a device", _special(PARTS_TABLE, _device), "a link"),
+    _parts("of two names", _two_names(PARTS_TABLE), "hard links"),
+    _parts("a FIFO", _special(PARTS_TABLE, os.mkfifo), "a FIFO"),
+    _parts("a socket", _special(PARTS_TABLE, _socket), "a socket"),
+    _parts("a folder", _special(PARTS_TABLE, Path.mkdir), "a folder"),
+    _parts("truncated", _raw(PARTS_TABLE, lambda data: data[:-1]), "manifest seals"),
+    _parts("empty", _raw(PARTS_TABLE, lambda data: b""), "manifest seals"),
+    _parts("an empty one sealed", _sealed(PARTS_TABLE, lambda data: b""), "columns"),
+    _parts("longer", _raw(PARTS_TABLE, lambda data: data + data), "does not seal", "verify"),
+    _parts("lines lie", _sealed(PARTS_TABLE, lambda data: data, lines=99), "manifest seals"),
+    _parts("bytes lie", _sealed(PARTS_TABLE, lambda data: data, bytes=2**10), "manifest seals"),
+    _parts("no header", _sealed(PARTS_TABLE, lambda data: data[len(HEADER) :]), "columns"),
+    _parts("another header", _sealed(PARTS_TABLE, lambda data: data.replace(b"step", b"stop", 1)), "columns"),
+    _parts("a header twice", _sealed(PARTS_TABLE, lambda data: HEADER + data), ""),
+    _parts(
+        "two parts in a line", _sealed(PARTS_TABLE, lambda data: b"]\n,[".join(data.rsplit(b"]\n[", 1))), ""
+    ),
+    _parts(
+        "one line of two parts",
+        _sealed(PARTS_TABLE, lambda data: b"],[".join(data.rsplit(b"]\n[", 1))),
+        "line",
+    ),
+    _parts("an object", _sealed(PARTS_TABLE, lambda data: data + b'{"task":0}\n'), ""),
+    _parts("NaN", _sealed(PARTS_TABLE, lambda data: data.replace(b"null", b"NaN", 1)), ""),
+    _parts("1e999", _sealed(PARTS_TABLE, lambda data: data.replace(b"null", b"1e999", 1)), ""),
+    _parts("no UTF-8", _sealed(PARTS_TABLE, lambda data: data.replace(b'"main"', b'"\xff"', 1)), ""),
+    _parts("deep", _sealed(PARTS_TABLE, lambda data: data + b"[" * 10**5 + b"\n"), ""),
+    _parts("a huge line", _sealed(PARTS_TABLE, lambda data: data + b"x" * 2**22 + b"\n"), "bytes"),
+    _parts("a million commas", _sealed(PARTS_TABLE, lambda data: data + b"," * 10**6 + b"\n"), ""),
+    _parts("300,000 lists", _sealed(PARTS_TABLE, lambda data: data + b"[" + b"[]," * 300_000 + b"[]]\n"), ""),
+    _parts("40,000 bad lines", _sealed(PARTS_TABLE, lambda data: data + b"[]\n" * 40_000), ""),
+    _parts("40,000 objects", _sealed(PARTS_TABLE, lambda data: data + b"{}\n" * 40_000), ""),
+    _parts("a part twice", lambda f: f.rows(PARTS_TABLE, lambda rows: rows.append(rows[1])), "twice"),
+    _parts("a value too few", lambda f: f.rows(PARTS_TABLE, lambda rows: rows[1].pop()), ""),
+    _parts("a value too many", lambda f: f.rows(PARTS_TABLE, lambda rows: rows[1].append(0)), ""),
+    _parts("task -1", _cell("task", -1), "0.0"),
+    _parts("task 2**70", _cell("task", 2**70), "0.0"),
+    _parts("task as path", _cell("task", "../7"), "0.0"),
+    _parts("task as float", _cell("task", 0.0), "0.0"),
+    _parts("step of 4000 digits", _cell("step", 10**3999), "0.1"),
+    _parts("step as flag", _cell("step", True), "0.1"),
+    _parts("run climbs", _cell("run", "../../../etc"), "0.2"),
+    _parts("run newline", _cell("run", "main\n"), "0.2"),
+    _parts("run NUL", _cell("run", "main\0"), "0.2"),
+    _parts("run escapes", _cell("run", ESCAPE), "0.2"),
+    _parts("run of 5000", _cell("run", "a" * 5000), "0.2"),
+    _parts("run that is none", _cell("run", "other"), "run"),
+    _parts("id newline", _cell("id", "a" * 64 + "\n"), "0.3"),
+    _parts("id climbs", _cell("id", "../" * 20), "0.3"),
+    _parts("sha256 in capitals", _cell("sha256", "A" * 64), "0.4"),
+    _parts("size below zero", _cell("size", -1), "0.5"),
+    _parts("size 2**62", _cell("size", 2**62), "0.5"),
+    _parts("platform -1", _cell("platform", -1), "0.6"),
+    _parts("platform 10**6", _cell("platform", 10**6), "0.6"),
+    _parts("platform that is none", _cell("platform", 1), "platform", "verify"),
+    _parts("mean as text", _cell("mean", "high"), "0.9"),
+    _parts("oracle as text", _cell("oracle", "high"), "0.15"),
+    _parts("part of no task", lambda f: f.rows(TASKS, lambda rows: rows.pop()), "names a task", "verify"),
+    _parts("of no task at all", _sealed(TASKS, lambda data: b""), "names a task", "verify"),
+]
+
+PLACES = [
+    _file("another id", _cell("id", "0" * 64), PART, "manifest", "read"),
+    _file("another sha256", _cell("sha256", "0" * 64), PART, "sha256"),
+    _file("another size", _cell("size", 1), PART, "instead of 1", "read"),
+    _file("oracle edited", _cell("oracle", 1e9), PART, "references.oracle"),
+    _file("mean edited in the table", _cell("mean", 1e9), PART, "statistics.mean"),
+    _file("success of nothing", _cell("success_rate", 1.0), PART, "statistics.success_rate"),
+    _file(
+        "another task in the table", _cell("task", 99, row=1), "parts/main/00099", "cannot be read", "read"
+    ),
+    _file("another step", _cell("step", 7), "0000007.zip", "is missing", "read"),
+    _file(
+        "billion lanes",
+        _recipe(lambda v: v["rollouts"].update(lanes=10**9, episodes=10**9)),
+        PART,
+        "identity.settings",
+    ),
+    _file("seed edited", _run(seed=9), PART, "identity.seed"),
+    _file("data version edited", _field(data_version=1), PART, "identity.data_version"),
+    _file(
+        "platform edited",
+        lambda f: f.manifest(lambda v: v["platforms"][0].update(cpu="another")),
+        PART,
+        "another platform",
+    ),
+]
+
 RECORDS = [
-    Case(
-        "20000 bad files",
-        lambda f: f.record(lambda v: v["files"].update({str(i): {} for i in range(20_000)})),
+    _part(
+        "20000 bad arrays",
+        _identity(lambda v: v["arrays"].update({str(i): {} for i in range(20_000)})),
         "part.json",
-        "files.",
+        "arrays",
     ),
-    Case("array climbs", _array_name("../../../../../outside/secret"), "part.json", "no array name"),
-    Case("array absolute", _array_name("/etc"), "part.json", "no array name"),
-    Case("array case", _array_name("Rewards"), "part.json", "no array name"),
-    Case("array lookalike", _array_name("rеwards"), "part.json", "no array name"),
-    Case("array newline", _array_name("rewards\n"), "part.json", "control characters"),
-    Case("array NUL", _array_name("rewards\0"), "part.json", "control characters"),
-    Case("array 5000", _array_name("a" * 5000), "part.json", "no array name"),
-    Case("array drive", _array_name("c:\\x"), "part.json", "no array name"),
-    Case("array without files", _array_name("success"), "success/zarr.json", "missing"),
-    Case("40 arrays", _many_arrays, "part.json", "identity.arrays"),
-    Case(
-        "file climbs",
-        lambda f: f.record(lambda v: v["files"].update({"../../secret": v["files"]["zarr.json"]})),
+    _part("array climbs", _array_name("../../../../../outside/secret"), "part.json", "no array name"),
+    _part("array absolute", _array_name("/etc"), "part.json", "no array name"),
+    _part("array case", _array_name("Rewards"), "part.json", "no array name"),
+    _part("array lookalike", _array_name("rеwards"), "part.json", "no array name"),
+    _part("array newline", _array_name("rewards\n"), "part.json", "control characters"),
+    _part("array NUL", _array_name("rewards\0"), "part.json", "control characters"),
+    _part("array 5000", _array_name("a" * 5000), "part.json", "no array name"),
+    _part("array drive", _array_name("c:\\x"), "part.json", "no array name"),
+    _part("array without files", _array_name("success"), "arrays/success/zarr.json", "missing"),
+    _part("40 arrays", _many_arrays, "part.json", "identity.arrays"),
+    _part("record missing", lambda f: f.take("part.json"), "part.json", "missing"),
+    _part("record empty", lambda f: f.write("part.json", b""), "part.json", "not a part record"),
+    _part("record a list", lambda f: f.write("part.json", b"[]"), "part.json", "schema_version"),
+    _part("record deep", lambda f: f.write("part.json", b"[" * 10**5), "part.json", "nested"),
+    _part(
+        "record of many values",
+        lambda f: f.write("part.json", b"[" + b"[]," * 200_000 + b"[]]"),
         "part.json",
-        "files names",
+        "values",
     ),
-    Case(
-        "file climbs inside",
-        lambda f: f.record(lambda v: v["files"].update({"rewards/../../x": v["files"]["zarr.json"]})),
+    _part(
+        "record of an earlier version",
+        lambda f: f.record(lambda v: v.update(schema_version=1)),
         "part.json",
-        "files names",
+        "schema_version 1",
     ),
-    Case(
-        "chunk unrecorded",
-        lambda f: f.record(lambda v: v["files"].pop("rewards/c/0")),
+    _part(
+        "id of another",
+        lambda f: f.record(lambda v: None, text=lambda t: t.replace('"step":150', '"step":151')),
         "part.json",
-        "rewards/c/0",
+        "id",
     ),
-    Case(
-        "policy unrecorded",
-        lambda f: f.record(lambda v: v["files"].pop("policy.json")),
-        "part.json",
-        "policy.json",
-    ),
-    Case(
+    _part("member unrecorded", lambda f: f.write("rewards/c/1", b""), "arrays/rewards/c/1", "agree"),
+    _part("chunk missing", lambda f: f.take("rewards/c/0"), "arrays/rewards/c/0", "agree"),
+    _part("policy missing", lambda f: f.take("policy.json"), "policy.json", "agree"),
+    _part("weights missing", lambda f: f.take("policy.safetensors"), "policy.safetensors", "missing"),
+    _part("code beside data", lambda f: f.write("policy.py", b"import os"), "policy.py", "agree"),
+    _part("pickle beside data", lambda f: f.write("policy.pkl", f.payload()), "policy.pkl", "agree"),
+    _part(
         "object array",
         _identity(lambda v: v["arrays"]["rewards"].update(dtype="object")),
         "part.json",
         "dtype",
     ),
-    Case(
+    _part(
         "float offsets",
         _identity(lambda v: v["arrays"]["episode_offsets"].update(dtype="float32")),
         "part.json",
         "episode_offsets",
     ),
-    Case(
+    _part(
         "negative shape",
         _identity(lambda v: v["arrays"]["actions"].update(shape=[-120, 2])),
         "part.json",
         "shape",
     ),
-    Case(
+    _part(
         "huge shape", _identity(lambda v: v["arrays"]["rewards"].update(shape=[2**80])), "part.json", "shape"
     ),
-    Case(
+    _part(
         "no episodes",
         _identity(lambda v: v["arrays"]["episode_offsets"].update(shape=[1])),
         "part.json",
         "shape",
     ),
-    Case("no rewards", _identity(lambda v: v["arrays"].pop("rewards")), "part.json", "rewards is missing"),
-    Case(
+    _part("no rewards", _identity(lambda v: v["arrays"].pop("rewards")), "part.json", "rewards is missing"),
+    _part(
         "mean 1e999",
         lambda f: f.record(lambda v: None, text=lambda t: t.replace('"mean":', '"mean":1e999,"x":')),
         "part.json",
         "too large",
     ),
-    Case(
+    _part(
+        "duplicate key in the record",
+        lambda f: f.record(lambda v: None, text=lambda t: t.replace('"mean":', '"mean":1,"mean":')),
+        "part.json",
+        "duplicate key 'mean'",
+    ),
+    _part(
         "mean edited",
         lambda f: f.record(lambda v: v["statistics"].update(mean=1e6)),
         "part.json",
         "statistics.mean",
         "verify",
     ),
-    Case(
+    _part(
         "record of 2 MB",
-        lambda f: f.record(lambda v: v["provenance"].update(host="x" * 2**21)),
+        lambda f: f.record(lambda v: v["behavior"].update(x="x" * 2**21)),
         "part.json",
         "bytes",
     ),
-    Case(
+    _part(
         "host escapes",
-        lambda f: f.record(lambda v: v["provenance"].update(host=ESCAPE)),
+        lambda f: f.record(lambda v: v["platform"].update(cpu=ESCAPE)),
         "part.json",
-        "provenance.host",
+        "platform.cpu",
     ),
-    Case("another seed", _identity(lambda v: v.update(seed=9)), "part.json", "identity.seed", "verify"),
-    Case("another task", _identity(lambda v: v.update(task=7)), "part.json", "identity.task"),
-    Case("parts swapped", _swap, "part.json", "identity.task"),
+    _part("another seed", _identity(lambda v: v.update(seed=9)), "", "identity.seed", "verify"),
+    _part("another task", _identity(lambda v: v.update(task=7)), "", "the manifest"),
+    _part("parts swapped", _swap, "", "the manifest"),
+]
+
+ARCHIVES = [
+    Case(f"archive: {name}", lambda forge, data=data: forge.archive(data), PART, (), "read")
+    for name, data in forged_archives.FORGED.items()
 ]
 
 LAYOUTS = [
-    Case("Zarr v2", _zarr(zarr_format=2), "rewards/zarr.json", "zarr_format"),
-    Case("Zarr v2 files", _v2, "rewards/zarr.json", "missing"),
-    Case("group as array", _zarr(node_type="group"), "rewards/zarr.json", "node_type"),
-    Case("object dtype", _zarr(data_type="|O"), "rewards/zarr.json", "data_type"),
-    Case("string dtype", _zarr(data_type="string"), "rewards/zarr.json", "data_type"),
-    Case("bytes dtype", _zarr(data_type="variable_length_bytes"), "rewards/zarr.json", "data_type"),
-    Case("structured dtype", _zarr(data_type={"name": "structured"}), "rewards/zarr.json", "data_type"),
-    Case("unknown codec", _zarr(codecs=[*CODECS, {"name": "evil"}]), "rewards/zarr.json", "codecs"),
-    Case("pickle codec", _zarr(codecs=[{"name": "numcodecs.pickle"}]), "rewards/zarr.json", "codecs"),
-    Case("sharding", _zarr(codecs=[SHARDS]), "rewards/zarr.json", "codecs"),
-    Case("storage transformer", _zarr(storage_transformers=[{"name": "x"}]), "rewards/zarr.json", "storage"),
-    Case("negative rows", _zarr(shape=[-1]), "rewards/zarr.json", "shape"),
-    Case("overflowing rows", _zarr(shape=[BIG]), "rewards/zarr.json", "shape"),
-    Case("rows beyond int64", _zarr(shape=[2**70]), "rewards/zarr.json", "shape"),
-    Case("ten axes", _zarr(shape=[1] * 10), "rewards/zarr.json", "shape"),
-    Case("rows as float", _zarr(shape=[120.0]), "rewards/zarr.json", "shape"),
-    Case("petabytes", lambda f: f.rows(2**39), PART, "shape asks for"),
-    Case(
+    _part("Zarr v2", _zarr(zarr_format=2), "rewards/zarr.json", "zarr_format"),
+    _part("no metadata", lambda f: f.take("rewards/zarr.json"), "rewards/zarr.json", "missing"),
+    _part("group as array", _zarr(node_type="group"), "rewards/zarr.json", "node_type"),
+    _part("object dtype", _zarr(data_type="|O"), "rewards/zarr.json", "data_type"),
+    _part("string dtype", _zarr(data_type="string"), "rewards/zarr.json", "data_type"),
+    _part("bytes dtype", _zarr(data_type="variable_length_bytes"), "rewards/zarr.json", "data_type"),
+    _part("structured dtype", _zarr(data_type={"name": "structured"}), "rewards/zarr.json", "data_type"),
+    _part("unknown codec", _zarr(codecs=[*CODECS, {"name": "evil"}]), "rewards/zarr.json", "codecs"),
+    _part("pickle codec", _zarr(codecs=[{"name": "numcodecs.pickle"}]), "rewards/zarr.json", "codecs"),
+    _part("sharding", _zarr(codecs=[SHARDS]), "rewards/zarr.json", "codecs"),
+    _part("storage transformer", _zarr(storage_transformers=[{"name": "x"}]), "rewards/zarr.json", "storage"),
+    _part("negative rows", _zarr(shape=[-1]), "rewards/zarr.json", "shape"),
+    _part("overflowing rows", _zarr(shape=[BIG]), "rewards/zarr.json", "shape"),
+    _part("rows beyond int64", _zarr(shape=[2**70]), "rewards/zarr.json", "shape"),
+    _part("ten axes", _zarr(shape=[1] * 10), "rewards/zarr.json", "shape"),
+    _part("rows as float", _zarr(shape=[120.0]), "rewards/zarr.json", "shape"),
+    _part("petabytes", lambda f: f.lengthen(2**39), "", "shape asks for"),
+    _part(
         "huge chunks",
         _zarr(chunk_grid={"name": "regular", "configuration": {"chunk_shape": [2**39]}}),
         "rewards/zarr.json",
         "chunk_grid",
     ),
-    Case(
+    _part(
         "empty chunks",
         _zarr(chunk_grid={"name": "regular", "configuration": {"chunk_shape": [0]}}),
         "rewards/zarr.json",
         "chunk_shape",
     ),
-    Case("chunk names", _zarr(chunk_key_encoding={"name": "v2"}), "rewards/zarr.json", "chunk_key_encoding"),
-    Case("attributes", _zarr(attributes={ESCAPE: 1}), "rewards/zarr.json", "attributes"),
-    Case("fill value", _zarr(fill_value="0x7fc00000"), "rewards/zarr.json", "fill_value"),
-    Case("axes of another array", _zarr(dimension_names=["episode"]), "rewards/zarr.json", "dimension_names"),
-    Case("unknown field", _zarr(must_understand=True), "rewards/zarr.json", "must_understand"),
-    Case(
+    _part("chunk names", _zarr(chunk_key_encoding={"name": "v2"}), "rewards/zarr.json", "chunk_key_encoding"),
+    _part("attributes", _zarr(attributes={ESCAPE: 1}), "rewards/zarr.json", "attributes"),
+    _part("fill value", _zarr(fill_value="0x7fc00000"), "rewards/zarr.json", "fill_value"),
+    _part(
+        "axes of another array", _zarr(dimension_names=["episode"]), "rewards/zarr.json", "dimension_names"
+    ),
+    _part("unknown field", _zarr(must_understand=True), "rewards/zarr.json", "must_understand"),
+    _part(
         "metadata NaN", lambda f: f.write("rewards/zarr.json", b'{"shape":NaN}'), "rewards/zarr.json", "NaN"
     ),
-    Case(
+    _part(
         "metadata deep", lambda f: f.write("rewards/zarr.json", b"[" * 10**4), "rewards/zarr.json", "nested"
     ),
-    Case("metadata big", lambda f: f.write("rewards/zarr.json", b" " * 10**6), "rewards/zarr.json", "bytes"),
-    Case(
+    _part("metadata big", lambda f: f.write("rewards/zarr.json", b" " * 10**6), "rewards/zarr.json", "bytes"),
+    _part(
         "group attributes",
         lambda f: f.write("zarr.json", b'{"zarr_format":3,"node_type":"group","attributes":{"x":1}}'),
-        f"{PART}/zarr.json",
+        "arrays/zarr.json",
         "attributes",
     ),
 ]
 
 CHUNKS = [
-    Case(
-        "bomb beyond the chunk", _chunk(rle_frame(2**24, declared=2**24)), "rewards/c/0", "declares", "read"
-    ),
-    Case("bomb declared small", _chunk(rle_frame(2**24, declared=480)), "rewards", "does not decode", "read"),
-    Case("frame of 2**63", _chunk(rle_frame(2**17, declared=2**63)), "rewards/c/0", "declares", "read"),
-    Case(
+    _part("bomb beyond the chunk", _chunk(rle_frame(2**24, declared=2**24)), "rewards/c/0", "declares"),
+    _part("bomb declared small", _chunk(rle_frame(2**24, declared=480)), "rewards", "does not decode"),
+    _part("frame of 2**63", _chunk(rle_frame(2**17, declared=2**63)), "rewards/c/0", "declares"),
+    _part(
         "frame without size",
         _chunk(with_checksum(b"\x28\xb5\x2f\xfd\x00\x58" + b"\x03\x00\x00\x00")),
         "rewards/c/0",
         "zstd frame",
-        "read",
     ),
-    Case(
+    _part(
         "two frames",
         lambda f: f.write("rewards/c/0", with_checksum(2 * rle_frame(480)[:-4])),
         "rewards",
         "does not decode",
-        "read",
     ),
-    Case("justified by nothing", _bomb, PART, "shape asks for"),
-    Case(
+    _part("justified by nothing", _bomb, "", "shape asks for"),
+    _part(
         "a pickle as chunk",
         lambda f: f.write("rewards/c/0", f.payload()),
         "rewards/c/0",
         "zstd frame",
-        "read",
     ),
-    Case("empty chunk", _chunk(b""), "rewards/c/0", "zstd frame", "read"),
-    Case("wrong checksum", _chunk(rle_frame(480)[:-4] + b"\0\0\0\0"), "rewards", "does not decode", "read"),
-    Case("other values", _chunk(rle_frame(480)), "rewards", "sha256", "verify"),
-    Case("NaN rewards", _nan_array, "rewards", "not finite", "verify"),
-    Case("offsets fall", _offsets([0, 20, 40, 30, 80, 100, 120]), "step_0000150", "episode_offsets", "read"),
-    Case(
+    _part("empty chunk", _chunk(b""), "rewards/c/0", "zstd frame"),
+    _part("wrong checksum", _chunk(rle_frame(480)[:-4] + b"\0\0\0\0"), "rewards", "does not decode"),
+    _part("other values", _chunk(rle_frame(480)), "rewards", "sha256", "verify"),
+    _part("NaN rewards", _nan_array, "rewards", "not finite", "verify"),
+    _part("offsets fall", _offsets([0, 20, 40, 30, 80, 100, 120]), "", "episode_offsets"),
+    _part(
         "offsets wrap",
         _offsets([0, BIG, -BIG - 1, -1, 80, 100, 120]),
-        "step_0000150",
+        "",
         "episode_offsets",
-        "read",
     ),
-    Case("offsets short", _offsets([0, 20, 40, 60, 80, 100, 119]), "step_0000150", "episode_offsets", "read"),
-    Case(
+    _part("offsets short", _offsets([0, 20, 40, 60, 80, 100, 119]), "", "episode_offsets"),
+    _part(
         "episodes moved",
         _offsets([0, 20, 40, 60, 80, 101, 120]),
-        "step_0000150/terminated",
+        "terminated",
         "last step",
         "verify",
     ),
 ]
 
 POLICIES = [
-    Case(
+    _part(
         "pickle as weights",
         lambda f: f.write("policy.safetensors", f.payload()),
         "policy.safetensors",
         "bytes",
-        "read",
     ),
-    Case(
+    _part(
         "pickle as policy",
         lambda f: f.write("policy.json", f.payload()),
         "policy.json",
         "not a policy",
-        "read",
     ),
-    Case(
+    _part(
         "SB3 zip",
         lambda f: f.write("policy.safetensors", SB3_ZIP),
         "policy.safetensors",
         "safetensors",
-        "read",
     ),
-    Case(
+    _part(
         "overlapping",
         lambda f: f.header(lambda h: h["mean.bias"].update(data_offsets=h["log_std.bias"]["data_offsets"])),
         "policy.safetensors",
         "safetensors",
-        "read",
     ),
-    Case(
+    _part(
         "huge offsets",
         lambda f: f.header(lambda h: h["mean.bias"].update(data_offsets=[0, 2**60])),
         "policy.safetensors",
         "safetensors",
-        "read",
     ),
-    Case(
+    _part(
         "negative offsets",
         lambda f: f.header(lambda h: h["mean.bias"].update(data_offsets=[-8, 0])),
         "policy.safetensors",
         "safetensors",
-        "read",
     ),
-    Case(
+    _part(
         "huge tensor",
         lambda f: f.header(lambda h: h["mean.bias"].update(shape=[2**62])),
         "policy.safetensors",
         "safetensors",
-        "read",
     ),
-    Case("header of 2**62", _repeated_header, "policy.safetensors", "safetensors", "read"),
-    Case(
+    _part("header of 2**62", _repeated_header, "policy.safetensors", "safetensors"),
+    _part(
         "unknown dtype",
         lambda f: f.header(lambda h: h["mean.bias"].update(dtype="F8_E4M3")),
         "policy.safetensors",
         "safetensors",
-        "read",
     ),
-    Case(
+    _part(
         "NaN weights",
         lambda f: f.weights(lambda t: t["mean.bias"].fill(np.nan)),
         "policy.safetensors",
         "mean.bias",
-        "read",
     ),
-    Case(
+    _part(
         "infinite weights",
         lambda f: f.weights(lambda t: t["mean.bias"].fill(np.inf)),
         "policy.safetensors",
         "mean.bias",
-        "read",
     ),
-    Case(
+    _part(
         "wrong shapes",
         lambda f: f.weights(lambda t: t.update({"mean.bias": np.zeros((1, 2), np.float32)})),
         "policy.safetensors",
         "shapes",
-        "read",
     ),
-    Case(
+    _part(
         "whole numbers",
         lambda f: f.weights(lambda t: t.update({"mean.bias": np.zeros(2, np.int32)})),
         "policy.safetensors",
         "mean.bias",
-        "read",
     ),
-    Case(
+    _part(
         "tensor escapes",
         lambda f: f.weights(lambda t: t.update({ESCAPE: t["mean.bias"]})),
         "policy.safetensors",
         "names",
-        "read",
     ),
-    Case(
+    _part(
         "tensor missing",
         lambda f: f.weights(lambda t: t.pop("mean.bias")),
         "policy.safetensors",
         "shapes",
-        "read",
     ),
-    Case(
+    _part(
         "other weights",
         lambda f: f.weights(lambda t: t["mean.bias"].fill(0.5)),
         "policy.json",
         "digest",
         "verify",
     ),
-    Case("terabyte layers", lambda f: f.policy(hidden=[65536] * 16), "policy.safetensors", "bytes", "read"),
-    Case("layer of 10**9", lambda f: f.policy(hidden=[10**9]), "policy.json", "hidden", "read"),
-    Case("thousand layers", lambda f: f.policy(hidden=[1] * 1000), "policy.json", "hidden", "read"),
-    Case("kind pickle", lambda f: f.policy(kind="pickle"), "policy.json", "kind", "read"),
-    Case(
+    _part("terabyte layers", lambda f: f.policy(hidden=[65536] * 16), "policy.safetensors", "bytes"),
+    _part("layer of 10**9", lambda f: f.policy(hidden=[10**9]), "policy.json", "hidden"),
+    _part("thousand layers", lambda f: f.policy(hidden=[1] * 1000), "policy.json", "hidden"),
+    _part("kind pickle", lambda f: f.policy(kind="pickle"), "policy.json", "kind"),
+    _part(
         "noise 1e999",
         lambda f: f.write("policy.json", b'{"kind":"scripted","observation":"full","noise":1e999}'),
         "policy.json",
         "too large",
-        "read",
     ),
-    Case("policy deep", lambda f: f.write("policy.json", b"[" * 10**4), "policy.json", "nested", "read"),
-    Case("policy big", lambda f: f.write("policy.json", b" " * 10**6), "policy.json", "bytes", "read"),
-    Case(
+    _part("policy deep", lambda f: f.write("policy.json", b"[" * 10**4), "policy.json", "nested"),
+    _part("policy big", lambda f: f.write("policy.json", b" " * 10**6), "policy.json", "bytes"),
+    _part(
         "scripted with weights",
         lambda f: f.write("policy.json", b'{"kind":"scripted","observation":"full","noise":0.1}'),
         "policy.json",
@@ -835,86 +831,66 @@ POLICIES = [
 SB3_ZIP = b"PK\x03\x04" + bytes(26) + b"data" + bytes(4096)
 
 FILES = [
-    Case("chunk linked", _link(f"{PART}/rewards/c/0"), "rewards/c/0", "a link"),
-    Case(
-        "chunk linked to a device",
-        _special(f"{PART}/rewards/c/0", lambda p: p.symlink_to("/dev/zero")),
-        "rewards/c/0",
+    _file("part linked", _link(PART), PART, "a link", "read"),
+    _file("part linked to a device", _special(PART, _device), PART, "a link", "read"),
+    _file(
+        "part linked to nothing", _special(PART, lambda p: p.symlink_to("/nothing")), PART, "a link", "read"
+    ),
+    _file("part linked to itself", _special(PART, lambda p: p.symlink_to(p.name)), PART, "a link", "read"),
+    _file(
+        "part linked to the other",
+        _special(PART, lambda p: p.symlink_to(f"../../../{OTHER}")),
+        PART,
         "a link",
+        "read",
     ),
-    Case(
-        "chunk linked to nothing",
-        _special(f"{PART}/rewards/c/0", lambda p: p.symlink_to("/nothing")),
-        "rewards/c/0",
-        "a link",
+    _file("task linked", _link("parts/main/00000"), "parts/main/00000", "a link", "read"),
+    _file("run linked", _link("parts/main"), "parts/main", "a link", "read"),
+    _file("parts linked", _link("parts"), "parts", "a link", "read"),
+    _file("manifest linked", _link(MANIFEST), MANIFEST, "a link", "open"),
+    _file("part of two names", _two_names(PART), PART, "hard links", "read"),
+    _file("manifest of two names", _two_names(MANIFEST), MANIFEST, "hard links", "open"),
+    _file("part a FIFO", _special(PART, os.mkfifo), PART, "a FIFO", "read"),
+    _file("manifest a FIFO", _special(MANIFEST, os.mkfifo), MANIFEST, "a FIFO", "open"),
+    _file("part a socket", _special(PART, _socket), PART, "a socket", "read"),
+    _file("part a folder", _special(PART, Path.mkdir), PART, "", "read"),
+    _file("part missing", lambda f: f.part.unlink(), PART, "missing", "read"),
+    _file(
+        "part of the other",
+        lambda f: f.archive((f.folder / OTHER).read_bytes()),
+        PART,
+        "the manifest",
+        "read",
     ),
-    Case(
-        "chunk linked to itself",
-        _special(f"{PART}/rewards/c/0", lambda p: p.symlink_to("0")),
-        "rewards/c/0",
-        "a link",
-    ),
-    Case("metadata linked", _link(f"{PART}/rewards/zarr.json"), "rewards/zarr.json", "a link"),
-    Case("policy linked", _link(f"{PART}/policy.json"), "policy.json", "a link"),
-    Case("record linked", _link(f"{PART}/part.json"), "part.json", "a link"),
-    Case("manifest linked", _link(MANIFEST), MANIFEST, "a link"),
-    Case("array linked", _link(f"{PART}/rewards"), "rewards", "a link"),
-    Case("part linked", _link(PART), PART, "a link"),
-    Case("snapshots linked", _link("tasks/00000/snapshots"), "tasks/00000/snapshots", "a link"),
-    Case("task linked", _link("tasks/00000"), "tasks/00000", "a link"),
-    Case("tasks linked", _link("tasks"), "tasks", "a link"),
-    Case(
-        "chunk of two names",
-        lambda f: os.link(f.part / "rewards/c/0", f.outside / "same"),
-        "rewards/c/0",
-        "hard links",
-    ),
-    Case(
-        "manifest of two names",
-        lambda f: os.link(f.folder / MANIFEST, f.outside / "same"),
-        MANIFEST,
-        "hard links",
-    ),
-    Case("chunk a FIFO", _special(f"{PART}/rewards/c/0", os.mkfifo), "rewards/c/0", "a FIFO"),
-    Case("metadata a FIFO", _special(f"{PART}/rewards/zarr.json", os.mkfifo), "rewards/zarr.json", "a FIFO"),
-    Case("record a FIFO", _special(f"{PART}/part.json", os.mkfifo), "part.json", "a FIFO"),
-    Case("policy a FIFO", _special(f"{PART}/policy.json", os.mkfifo), "policy.json", "a FIFO"),
-    Case("manifest a FIFO", _special(MANIFEST, os.mkfifo), MANIFEST, "a FIFO"),
-    Case("chunk a socket", _special(f"{PART}/rewards/c/0", _socket), "rewards/c/0", "a socket"),
-    Case("chunk a folder", _special(f"{PART}/rewards/c/0", Path.mkdir), "rewards/c/0", "a folder"),
-    Case("chunk missing", lambda f: f.rename("rewards/c/0"), "rewards/c/0", "missing"),
-    Case("weights missing", lambda f: f.rename("policy.safetensors"), "policy.safetensors", "missing"),
-    Case(
-        "file of odd name", lambda f: (f.folder / "tasks" / f"a{ESCAPE}").touch(), ESCAPE, "no part", "verify"
-    ),
-    Case(
+    _file("file of odd name", lambda f: (f.folder / "parts" / f"a{ESCAPE}").touch(), ESCAPE, "no part"),
+    _file(
         "file of broken name",
         lambda f: Path(os.fsdecode(bytes(f.folder) + b"/\xff\xfe")).touch(),
         "\udcff\udcfe",
         "no part",
-        "verify",
     ),
-    Case(
-        "code beside data",
-        lambda f: (f.part / "sitecustomize.py").write_text("import os"),
+    _file(
+        "code beside the part",
+        lambda f: (f.part.parent / "sitecustomize.py").write_text("import os"),
         "sitecustomize.py",
         "no part",
-        "verify",
     ),
-    Case(
-        "pickle beside data",
-        lambda f: (f.part / "policy.pkl").write_bytes(f.payload()),
+    _file(
+        "pickle beside the part",
+        lambda f: (f.part.parent / "policy.pkl").write_bytes(f.payload()),
         "policy.pkl",
         "no part",
-        "verify",
     ),
-    Case(
-        "lock linked",
-        lambda f: (f.folder / ".lock").symlink_to(f.outside / "secret"),
-        ".lock",
-        "a link",
-        "verify",
+    _file(
+        "part of an odd number",
+        lambda f: (f.part.parent / "150.zip").write_bytes(f.part.read_bytes()),
+        "150.zip",
+        "no part",
     ),
+    _file("lock linked", lambda f: (f.folder / ".lock").symlink_to(f.outside / "secret"), ".lock", "a link"),
 ]
 
-CASES = [*MANIFESTS, *RECORDS, *LAYOUTS, *CHUNKS, *POLICIES, *FILES]
+CASES = [
+    *(*MANIFESTS, *TASK_TABLES, *PART_TABLES, *PLACES, *RECORDS),
+    *(*ARCHIVES, *LAYOUTS, *CHUNKS, *POLICIES, *FILES),
+]

@@ -277,9 +277,9 @@ class Ledger:
         """
         for task in self._steps:
             place = part_folder(PartKey(task, 0))
-            if not os.path.lexists(self._out / place):
-                continue
             blocked = folder_problem(self._out, place)
+            if blocked and not os.path.lexists(self._out / blocked[0]):
+                continue
             if blocked:
                 raise StoreError(f"{self._out / blocked[0]} {blocked[1]}; delete it")
             with os.scandir(self._out / place) as entries:

@@ -1,5 +1,7 @@
 """What a build keeps in a dataset's folder beside the data: locks, staging, checkpoints, the event log."""
 
+import contextlib
+import os
 import re
 import stat
 from collections.abc import Collection, Sequence
@@ -22,7 +24,7 @@ TABLES = {TASKS, PARTS_TABLE}
 
 
 def check_work_files(folder: Path, *, but: Collection[str] = ()) -> None:
-    """Refuses a dataset whose work files or folders are links, which would lead writing out of it.
+    """Refuses a dataset whose work files, or anything in its work folders, would lead writing out of it.
 
     Args:
         folder: the dataset.
@@ -40,6 +42,20 @@ def check_work_files(folder: Path, *, but: Collection[str] = ()) -> None:
         is_file = name in WORK_FILES | TABLES
         if file_problem(status) if is_file else not is_folder:
             raise BuildError(f"{folder / name} is not the plain file or folder that a build makes; delete it")
+    for name in sorted(WORK_FOLDERS):
+        _check_work_folder(folder / name)
+
+
+def _check_work_folder(folder: Path) -> None:
+    """Refuses links, pipes and devices at any depth of a folder; others may change it meanwhile."""
+    waiting = [folder]
+    while waiting:
+        with contextlib.suppress(FileNotFoundError), os.scandir(waiting.pop()) as entries:
+            for entry in entries:
+                if entry.is_dir(follow_symlinks=False):
+                    waiting.append(Path(entry.path))
+                elif not entry.is_file(follow_symlinks=False) and os.path.lexists(entry.path):
+                    raise BuildError(f"{entry.path} is no plain file or folder; delete it")
 
 
 _CHECKPOINT_NAME = re.compile(r"tasks?_([0-9]{5,10})(?:_([0-9]{5,10}))?")

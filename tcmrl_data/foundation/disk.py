@@ -4,6 +4,7 @@ import contextlib
 import errno
 import os
 import shutil
+import stat
 import tempfile
 import uuid
 from collections.abc import Iterator, Mapping
@@ -249,7 +250,7 @@ def is_current(file: IO[Any], path: Path) -> bool:
 
 def _open_lock(path: Path) -> TextIO:
     try:
-        return path.open("a+")
+        return open(path, "a+", opener=_open_no_link)
     except OSError as error:
         if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
             raise
@@ -258,17 +259,22 @@ def _open_lock(path: Path) -> TextIO:
         ) from None
 
 
+def _open_no_link(path: str, flags: int) -> int:
+    """Opens a file as `open` does, but no link: that of a stranger's dataset may lead anywhere."""
+    return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
+
+
 def lock_holder(path: Path) -> str | None:
     """The process that holds the lock of `lock_file`, or None if no process does.
 
     Asking takes no lock, so that it may be done at any time; the file may be read-only.
     """
-    if not path.is_file():
-        return None
     try:
-        with path.open("rb") as file:
+        if not stat.S_ISREG(path.lstat().st_mode):
+            return None
+        with open(path, "rb", opener=_open_no_link) as file:
             return _holder(file) if is_locked(file) else None
-    except FileNotFoundError:  # removed meanwhile
+    except (FileNotFoundError, NotADirectoryError):  # removed meanwhile, or never there
         return None
 
 

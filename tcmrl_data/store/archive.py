@@ -5,6 +5,7 @@ from the first byte on, then the directory, then the end record. The reader rebu
 size and checksum and compares, so that no byte of the file is without a meaning.
 """
 
+import hashlib
 import re
 import struct
 from collections.abc import Mapping
@@ -36,6 +37,9 @@ _NAME = re.compile(rb"[a-z0-9_][a-z0-9_.]*(?:/[a-z0-9_][a-z0-9_.]*)*")
 
 _TAIL_BYTES = 2**14
 """Read first: end record and directory of up to about 200 members."""
+
+_HASHED_BYTES = 2**22
+"""Read at once to be hashed."""
 
 
 class _Member(NamedTuple):
@@ -175,6 +179,17 @@ class Archive:
             StoreError: it cannot be read.
         """
         return self._read_range(0, self.size)
+
+    def sha256(self) -> str:
+        """The sha256 of the whole file, in hexadecimal; takes little memory.
+
+        Raises:
+            StoreError: it cannot be read.
+        """
+        digest = hashlib.sha256()
+        for offset in range(0, self.size, _HASHED_BYTES):
+            digest.update(self._read_range(offset, min(_HASHED_BYTES, self.size - offset)))
+        return digest.hexdigest()
 
     def _read_directory(self) -> dict[str, _Member]:
         """All members by name, from the directory at the end of the file.

@@ -4,9 +4,9 @@ Tasks and parts stand in tables beside it (`tables.py`). The manifest seals them
 """
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import Field, model_validator
+from pydantic import FailFast, Field, model_validator
 
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, canonical_json, digest, parse_json
 from tcmrl_data.foundation.errors import ManifestError
@@ -15,7 +15,7 @@ from tcmrl_data.foundation.records import Record, parse_record
 from tcmrl_data.recipe.profile import Profile
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.keys import RUN_NAME
-from tcmrl_data.store.limits import MAX_COUNT, MAX_PARTS, MAX_PLATFORMS, MAX_RUNS, MAX_TASKS
+from tcmrl_data.store.limits import MAX_COUNT, MAX_INDEX, MAX_PARTS, MAX_PLATFORMS, MAX_RUNS, MAX_TASKS
 from tcmrl_data.store.part_record import SHA256
 from tcmrl_data.store.platform import Platform
 
@@ -23,6 +23,8 @@ MANIFEST_SCHEMA = 2
 """Raised when the meaning or the layout of a dataset's files changes."""
 
 MANIFEST = "manifest.json"
+
+_Index = Annotated[int, Field(ge=0, lt=MAX_INDEX)]
 
 RunKind = Literal["built", "extended", "relabelled", "imported", "recorded", "subset"]
 
@@ -43,7 +45,7 @@ class Run(Record):
     seed: int | None = Field(ge=0)
     recipe: Recipe | None
     origin: dict[str, Any] | None = None
-    steps: tuple[int, ...] | None
+    steps: tuple[_Index, ...] | None
 
     @model_validator(mode="after")
     def _steps_are_sorted(self) -> "Run":
@@ -119,12 +121,12 @@ class Manifest(Record):
     name: str = Field(pattern=r"^[a-z0-9_/-]{1,64}$")
     label: str | None = Field(default=None, max_length=200)
     data_version: int
-    runs: tuple[Run, ...] = Field(min_length=1, max_length=MAX_RUNS)
+    runs: Annotated[tuple[Run, ...], FailFast()] = Field(min_length=1, max_length=MAX_RUNS)
     derivation: Derivation | None = None
-    platforms: tuple[Platform, ...] = Field(max_length=MAX_PLATFORMS)
+    platforms: Annotated[tuple[Platform, ...], FailFast()] = Field(max_length=MAX_PLATFORMS)
     tasks: TableSeal
     parts: TableSeal
-    dropped: tuple[int, ...] = Field(max_length=MAX_TASKS)
+    dropped: tuple[_Index, ...] = Field(max_length=MAX_TASKS)
     totals: Totals
     root: str = Field(pattern=SHA256)
     complete: bool
@@ -177,6 +179,8 @@ class Manifest(Record):
             raise ValueError("dropped must be sorted, each once")
         if self.num_tasks < 0 or self.tasks.lines > MAX_TASKS or self.parts.lines > 1 + MAX_PARTS:
             raise ValueError(f"a dataset has at most {MAX_TASKS} tasks and {MAX_PARTS} parts")
+        if self.num_expected > MAX_PARTS:
+            raise ValueError(f"the runs call for {self.num_expected} parts, more than {MAX_PARTS}")
         return self
 
 
@@ -223,7 +227,8 @@ def _refuse_older(values: Any, file: Path) -> None:
     Raises:
         ManifestError: the manifest has schema version 1.
     """
-    if not isinstance(values, dict) or values.get("schema_version") != 1:
+    version = values.get("schema_version") if isinstance(values, dict) else None
+    if version != 1 or isinstance(version, bool):
         return
     recipe = values.get("recipe")
     profile = recipe.get("profile") if isinstance(recipe, dict) else None

@@ -155,7 +155,15 @@ def read_part_record(archive: Archive) -> PartRecord:
         raise ManifestError(
             f"{place}: not a part record ({one_line(error)}); run `tcmrl-data repair`"
         ) from None
+    if _num_arrays(values) > MAX_ARRAYS:  # an error about each would take much memory
+        raise ManifestError(f"{place}: identity.arrays names more than {MAX_ARRAYS} arrays")
     record = parse_record(PartRecord, values, place, version=PART_SCHEMA)
     if record.id != digest(values["identity"]):
         raise ManifestError(f"{place}: id is not the digest of its identity; run `tcmrl-data repair`")
     return record
+
+
+def _num_arrays(values: Any) -> int:
+    identity = values.get("identity") if isinstance(values, dict) else None
+    arrays = identity.get("arrays") if isinstance(identity, dict) else None
+    return len(arrays) if isinstance(arrays, dict) else 0

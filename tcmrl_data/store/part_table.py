@@ -233,6 +233,8 @@ def parse_parts(data: bytes, file: Path) -> PartTable:
         return PartTable.empty()
     columns = {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
     table = PartTable(list(runs), columns)
+    if len(table) != data.count(b"\n") - 1:
+        raise ManifestError(f"{file}: its lines do not hold one part each")
     keys = np.stack([table.columns[name] for name in ("task", "step", "run")])
     if (keys[:, 1:] == keys[:, :-1]).all(axis=0).any():
         raise ManifestError(f"{file}: a part stands there twice")

@@ -60,9 +60,10 @@ def blocks(data: bytes, file: Path) -> Iterator[bytes]:
     start = 0
     while start < len(data):
         end = data.rfind(b"\n", start, start + BLOCK_BYTES)
-        if end < 0:
+        lines = data[start : max(end, start)].split(b"\n")
+        if end < 0 or max(map(len, lines)) > LINE_BYTES:
             raise ManifestError(f"{file}: a line has more than {LINE_BYTES} bytes")
-        yield b"[" + data[start:end].replace(b"\n", b",") + b"]"
+        yield b"[" + b",".join(lines) + b"]"
         start = end + 1
 
 

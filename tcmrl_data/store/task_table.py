@@ -49,12 +49,19 @@ def parse_tasks(data: bytes, file: Path) -> tuple[Task, ...]:
         for block in blocks(data, file)
         for record in _parse_block(block, file)
     ]
-    if b"".join(map(task_line, tasks)) != data:
+    if not _is_canonical(tasks, data):
         raise ManifestError(f"{file}: its lines are not written as canonical JSON")
     ordered = sorted(tasks, key=lambda task: task.index)
     if len({task.index for task in tasks}) < len(tasks):
         raise ManifestError(f"{file}: a task stands there twice")
     return tuple(ordered)
+
+
+def _is_canonical(tasks: Iterable[Task], data: bytes) -> bool:
+    try:
+        return b"".join(map(task_line, tasks)) == data
+    except ValueError:  # NaN or infinity in a task's parameters
+        return False
 
 
 def _parse_block(block: bytes, file: Path) -> Iterable[TaskRecord]:

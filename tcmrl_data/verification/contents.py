@@ -38,7 +38,7 @@ def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None
         record: its record.
         recipe: what it was built from; None where that is not known.
     """
-    environment = None if recipe is None else _environment(recipe)
+    environment = None if recipe is None else recipe_environment(recipe)
     yield from _policy_problems(archive, record, environment)
     arrays: dict[str, npt.NDArray[Any]] = {}
     for name, recorded in record.identity.arrays.items():
@@ -71,12 +71,9 @@ def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None
 
 def task_problems(tasks: Sequence[Task], recipe: Recipe) -> Iterator[str]:
     """Yields the differences of a dataset's tasks from those that its recipe draws."""
-    environment = _environment(recipe)
+    environment = recipe_environment(recipe)
     if isinstance(environment, str):
         yield environment
-        return
-    if environment.settings.tasks > MAX_TASKS:
-        yield f"recipe.environment.tasks is {environment.settings.tasks}, more than {MAX_TASKS}"
         return
     drawn = {task.index: task for task in draw_tasks(environment)}
     for task in tasks:
@@ -99,14 +96,17 @@ def is_close(left: Any, right: Any) -> bool:
     return bool(left == right)
 
 
-def _environment(recipe: Recipe) -> Environment | str:
-    """The recipe's environment, or the reason why it cannot be made."""
+def recipe_environment(recipe: Recipe) -> Environment | str:
+    """The recipe's environment, or the reason why it cannot be made or has more tasks than a dataset may."""
     try:
-        return recipe.make_environment()
+        environment = recipe.make_environment()
     except ValidationError as error:
         return f"recipe.environment: {first_problem(error)}"
     except TcmrlError as error:
         return f"recipe.environment: {error}"
+    if environment.settings.tasks > MAX_TASKS:
+        return f"recipe.environment.tasks is {environment.settings.tasks}, more than {MAX_TASKS}"
+    return environment
 
 
 def _policy_problems(

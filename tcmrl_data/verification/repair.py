@@ -127,9 +127,12 @@ def _replace_parts(
     """
     dataset = Dataset(folder, read_manifest(folder))
     made: dict[PartKey, Path] = {}
+    unknown = {key.run for key in keys} - {run.name for run in dataset.manifest.runs}
+    if unknown:
+        return (f"{folder}: the manifest has no run {min(unknown)}; restore it from a copy",)
     for run in dataset.manifest.runs:
         chosen = [key for key in keys if key.run == run.name]
-        if chosen and (run.recipe is None or run.kind != "built"):
+        if chosen and (run.recipe is None or run.seed is None or run.kind != "built"):
             return (f"{len(chosen)} parts of run {run.name} were not built here; restore them from a copy",)
         if chosen:
             target = folder / STAGING / REPAIR / run.name

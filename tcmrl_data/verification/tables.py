@@ -16,6 +16,7 @@ from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartEntry, PartTabl
 from tcmrl_data.store.platform import Platform
 from tcmrl_data.store.tables import read_sealed, seal_of
 from tcmrl_data.store.task_table import TASKS, parse_tasks, task_line
+from tcmrl_data.verification.contents import recipe_environment
 from tcmrl_data.verification.scan import scan_dataset
 
 
@@ -90,18 +91,26 @@ def _read_parts(folder: Path) -> list[Published]:
 
     def read(key: PartKey) -> Published | None:
         try:
-            return read_published(folder / part_file(key), key.run)[0]
+            published = read_published(folder / part_file(key), key.run)[0]
         except (StoreError, ManifestError):
             return None
+        return published if published.entry.key == key else None
 
     with ThreadPoolExecutor(available_cores()) as pool:
         return [part for part in pool.map(read, keys) if part is not None]
 
 
 def _draw_again(table: PartTable, manifest: Manifest) -> tuple[Task, ...]:
-    """The tasks of the parts and of the recipe's choice, as the recipe draws them."""
+    """The tasks of the parts and of the recipe's choice, as the recipe draws them.
+
+    Raises:
+        ManifestError: the recipe's environment cannot be made, or has more tasks than a dataset may have.
+    """
     recipe = manifest.recipe
+    environment = recipe_environment(recipe)
+    if isinstance(environment, str):
+        raise ManifestError(f"{MANIFEST}: {environment}")
     present = set(table.columns["task"].tolist())
     if len(present) < manifest.tasks.lines:
         present |= {task.index for task in choose_tasks(recipe)}
-    return tuple(task for task in draw_tasks(recipe.make_environment()) if task.index in present)
+    return tuple(task for task in draw_tasks(environment) if task.index in present)
