@@ -1,3 +1,4 @@
+import errno
 import json
 import os
 import shutil
@@ -32,8 +33,11 @@ from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 from tcmrl_data.foundation.disk import LOCK, lock_file
 from tcmrl_data.foundation.errors import BuildError, LockedError, ManifestError, StoreError
 from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.store import archive as archive_module
+from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
+from tcmrl_data.store.part_record import PART_SCHEMA, RECORD
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import TASKS as TASKS_TABLE
 from tests.conftest import TASKS, TINY
@@ -175,6 +179,29 @@ def test_two_builders_at_once_one_is_refused_by_name(tiny_copy: Copy, tiny_recip
     folder = tiny_copy()
     with lock_file(folder / LOCK, "the dataset"), pytest.raises(LockedError, match=f"process {os.getpid()}"):
         tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+
+
+def test_a_part_that_a_later_version_made_or_that_cannot_be_read_is_not_deleted(
+    tiny_copy: Copy, tiny_recipe: Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = tiny_copy()
+    forget(folder)
+    file = folder / part_file(PartKey(3, 100))
+    with Archive(file) as archive:
+        members = {name: archive.read(name) for name in archive.names}
+    later = json.loads(members[RECORD]) | {"schema_version": PART_SCHEMA + 1}
+    data = pack_archive(members | {RECORD: tcmrl_data.canonical_json(later)})
+    file.write_bytes(data)
+    with pytest.raises(StoreError, match=f"{file}: its record is not of this version; delete it"):
+        tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+
+    def refuse(descriptor: int, size: int, offset: int) -> bytes:
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(archive_module, "pread", refuse)
+    with pytest.raises(StoreError, match=r"cannot be read \(Input/output error\); try again, or delete it"):
+        tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
+    assert file.read_bytes() == data
 
 
 @pytest.mark.parametrize("name", [TASKS_TABLE, PARTS_TABLE])

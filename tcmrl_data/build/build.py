@@ -35,7 +35,7 @@ class BuildReport:
 
     Attributes:
         built: parts made now.
-        present: parts that were there and whose digests held.
+        present: parts that were there, with the recorded sizes.
         failed: one line per unit that failed.
         root: Merkle root of the dataset as it now stands.
         read_only: the folder cannot be written, and nothing had to be.
@@ -62,7 +62,7 @@ def build_dataset(
     address: str | None = None,
     progress: Callable[[BuildEvent], None] = lambda event: None,
 ) -> BuildReport:
-    """Builds what is missing of a dataset; on a finished one it verifies and changes nothing.
+    """Builds what is missing of a dataset; a finished one is left as it is.
 
     Args:
         recipe: what to build.
@@ -125,8 +125,8 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
     if not is_dataset:
         return
     manifest = read_manifest(out)
-    if manifest.derivation is not None or manifest.runs[0].kind != "built":
-        raise BuildError(f"{out} was derived from other datasets and cannot be built; use another --out")
+    if manifest.derivation is not None or [run.kind for run in manifest.runs] != ["built"]:
+        raise BuildError(f"{out} holds parts that no build makes; use another --out")
     if manifest.data_version != DATA_VERSION:
         raise BuildError(
             f"{out} has data version {manifest.data_version}, not {DATA_VERSION}; use another --out"

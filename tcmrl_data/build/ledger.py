@@ -9,7 +9,7 @@ from pathlib import Path
 from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.published import Published, read_published
 from tcmrl_data.foundation.disk import STAGING, named_errors, replace_file
-from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
+from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError, UnreadableError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem
 from tcmrl_data.foundation.shared_folder import wait_until_visible
@@ -301,14 +301,19 @@ class Ledger:
         """A part that the tables do not name; None if it is damaged.
 
         Raises:
-            StoreError: it is a sound part, but of other settings, another seed or another task.
+            StoreError: it is a sound part, but of other settings, another seed, another task or another
+                version, or the operating system refuses to read it.
         """
         file = self._out / part_file(key)
         try:
             published, record = read_published(file, key.run)
-        except (StoreError, ManifestError):
+        except UnreadableError as error:
+            raise UnreadableError(f"{error}; try again, or delete it") from None
+        except StoreError:
             self.damaged.append(file)
             return None
+        except ManifestError:
+            raise StoreError(f"{file}: its record is not of this version; delete it") from None
         identity = record.identity
         if (identity.task, identity.step, identity.seed) != (key.task, key.step, self.plan.seed):
             raise StoreError(f"{file}: holds another part; delete it")

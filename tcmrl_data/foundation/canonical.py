@@ -8,7 +8,7 @@ from typing import Any, NoReturn
 MAX_JSON_BYTES = 16 * 2**20
 
 MAX_JSON_VALUES = 2**17
-"""About 26,000 parts in a manifest. An empty list takes 3 bytes of text and 64 of memory."""
+"""An empty list takes 3 bytes of text and 64 of memory."""
 
 MAX_JSON_DEPTH = 32
 

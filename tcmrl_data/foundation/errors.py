@@ -29,6 +29,10 @@ class StoreError(TcmrlError):
     """A part on disk whose files, layout or values are not valid."""
 
 
+class UnreadableError(StoreError):
+    """A part that the operating system refuses to read now; it may be sound."""
+
+
 class ManifestError(TcmrlError):
     """A manifest that is missing, truncated, edited, or has another schema version."""
 

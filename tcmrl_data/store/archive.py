@@ -15,7 +15,7 @@ from types import TracebackType
 from typing import NamedTuple, Self
 from zlib import crc32
 
-from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.errors import StoreError, UnreadableError
 from tcmrl_data.foundation.plain_files import one_line, open_plain_file, printable
 
 LARGEST_ARCHIVE = 2**31
@@ -117,7 +117,7 @@ class Archive:
         except FileNotFoundError:
             raise StoreError(f"{path} is missing{REPAIR}") from None
         except OSError as error:
-            raise StoreError(f"{path} cannot be read ({one_line(error)})") from None
+            raise UnreadableError(f"{path} cannot be read ({one_line(error)})") from None
         except ValueError as error:
             raise StoreError(f"{path} {error}{REPAIR}") from None
         try:
@@ -253,7 +253,7 @@ class Archive:
                     break
                 data += more
         except OSError as error:
-            raise StoreError(f"{self.path} cannot be read ({one_line(error)})") from None
+            raise UnreadableError(f"{self.path} cannot be read ({one_line(error)})") from None
         return data
 
     def _refusal(self, problem: str) -> StoreError:
