@@ -217,8 +217,7 @@ def test_zarr_and_tensorstore_read_the_arrays_of_an_archive(path: Path) -> None:
         "observations": random.normal(size=(30, 3)).astype(np.float32),
         "terminated": np.eye(1, 29)[0] > 0,
     }
-    files = {f"arrays/{name}": content for name, content in encode_arrays(arrays).items()}
-    path.write_bytes(pack_archive({**files, "part.json": b"{}"}))
+    path.write_bytes(pack_archive({**encode_arrays(arrays), "part.json": b"{}"}))
     with zarr.storage.ZipStore(path, mode="r") as store:
         group = zarr.open_group(store, path="arrays", mode="r")
         assert sorted(group.array_keys()) == sorted(arrays)

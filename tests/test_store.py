@@ -1,18 +1,26 @@
 import json
+import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tensorstore
+import zarr
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from zarr.storage import ZipStore
 
 from tcmrl_data import Dataset, Trajectory
-from tcmrl_data.foundation.disk import write_tree
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.store import arrays as store_module
-from tcmrl_data.store.arrays import array_files, encode_arrays, pack, read_arrays, unpack
+from tcmrl_data.store.archive import Archive, pack_archive
+from tcmrl_data.store.arrays import encode_arrays, pack, read_arrays, unpack
+from tcmrl_data.store.keys import PartKey
 from tests.strategies import trajectories
+
+PART = PartKey(0, 150)
 
 
 def same(left: Trajectory, right: Trajectory) -> bool:
@@ -22,16 +30,23 @@ def same(left: Trajectory, right: Trajectory) -> bool:
     )
 
 
+def written(file: Path, files: dict[str, bytes]) -> Archive:
+    """Files as an archive, opened."""
+    file.write_bytes(pack_archive(files))
+    return Archive(file)
+
+
 @given(st.lists(trajectories(), min_size=1, max_size=5), st.sampled_from([16, 100, 10**6]))
 @settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_episodes_survive_disk_at_any_chunk_size(
     tmp_path_factory: pytest.TempPathFactory, episodes: list[Trajectory], chunk_bytes: int
 ) -> None:
-    folder = tmp_path_factory.mktemp("part") / "part"
+    file = tmp_path_factory.mktemp("part") / "part.zip"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(store_module, "CHUNK_BYTES", chunk_bytes)
-        write_tree(folder, encode_arrays(pack(episodes)))
-    back = unpack(read_arrays(folder, pack(episodes)))
+        files = encode_arrays(pack(episodes))
+    with written(file, files) as archive:
+        back = unpack(read_arrays(archive, pack(episodes)))
     assert len(back) == len(episodes)
     assert all(same(*pair) for pair in zip(back, episodes, strict=True))
 
@@ -47,19 +62,12 @@ def test_observations_hold_one_row_more_per_episode() -> None:
 def test_a_missing_chunk_is_an_error_not_zeros(tmp_path: Path) -> None:
     flags = np.zeros(3, dtype=bool)
     episode = Trajectory(np.ones((4, 2)), np.ones((3, 1)), np.ones(3), flags, flags)
-    write_tree(tmp_path / "part", encode_arrays(pack([episode])))
-    (tmp_path / "part" / "terminated" / "c" / "0").unlink()
-    with pytest.raises(StoreError, match="terminated/c/0 is missing"):
-        read_arrays(tmp_path / "part", ["terminated"])
-
-
-def test_tensorstore_reads_the_same_bytes(tiny: Dataset) -> None:
-    folder = tiny.folder_of(0, 150)
-    for name, array in tiny.arrays(0, 150).items():
-        spec = {"driver": "zarr3", "kvstore": {"driver": "file", "path": str(folder / name)}}
-        other = tensorstore.open(spec).result().read().result()
-        assert (other.dtype, other.shape) == (array.dtype, array.shape)
-        assert other.tobytes() == array.tobytes(), name
+    files = encode_arrays(pack([episode]))
+    del files["arrays/terminated/c/0"]
+    with written(tmp_path / "part.zip", files) as archive:
+        with pytest.raises(StoreError, match=r"part.zip: arrays/terminated/c/0 is missing"):
+            read_arrays(archive, ["terminated"])
+        assert read_arrays(archive, ["rewards"])["rewards"].tolist() == [1, 1, 1]
 
 
 @pytest.mark.parametrize(
@@ -81,20 +89,23 @@ def test_tensorstore_reads_the_same_bytes(tiny: Dataset) -> None:
     ],
 )
 def test_metadata_outside_the_allow_list_is_refused(tmp_path: Path, field: str, value: object) -> None:
-    write_tree(tmp_path / "part", encode_arrays({"actions": np.ones((3, 2), dtype=np.float32)}))
-    assert array_files(tmp_path / "part", "actions") == ["actions/zarr.json", "actions/c/0/0"]
-    file = tmp_path / "part" / "actions" / "zarr.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {field: value}))
-    with pytest.raises(StoreError, match=field):
-        read_arrays(tmp_path / "part", ["actions"])
+    files = encode_arrays({"actions": np.ones((3, 2), dtype=np.float32)})
+    assert list(files) == ["arrays/actions/c/0/0", "arrays/actions/zarr.json", "arrays/zarr.json"]
+    metadata = "arrays/actions/zarr.json"
+    files[metadata] = json.dumps(json.loads(files[metadata]) | {field: value}).encode()
+    with (
+        written(tmp_path / "part.zip", files) as archive,
+        pytest.raises(StoreError, match=rf"part.zip: {metadata}: .*{field}"),
+    ):
+        read_arrays(archive, ["actions"])
 
 
 def test_every_array_names_its_axes(tiny: Dataset) -> None:
-    folder = tiny.folder_of(0, 150)
-    names = {
-        name: json.loads((folder / name / "zarr.json").read_text())["dimension_names"]
-        for name in tiny.arrays(0, 150)
-    }
+    with tiny.open_part(PART) as archive:
+        names = {
+            name: json.loads(archive.read(f"arrays/{name}/zarr.json"))["dimension_names"]
+            for name in tiny.arrays(*PART)
+        }
     assert names == {
         "observations": ["observation_row", "observation"],
         "actions": ["step", "action"],
@@ -112,8 +123,9 @@ def test_xarray_opens_a_part_of_episodes_of_several_lengths(tmp_path: Path) -> N
         Trajectory(np.ones((len(ended) + 1, 4)), np.ones((len(ended), 2)), np.ones(len(ended)), ended, ended)
         for ended in flags
     ]
-    write_tree(tmp_path / "part", encode_arrays(pack(episodes)))
-    opened = xarray.open_zarr(tmp_path / "part", consolidated=False, zarr_format=3)
+    written(tmp_path / "part.zip", encode_arrays(pack(episodes))).close()
+    with ZipStore(tmp_path / "part.zip", mode="r") as store:
+        opened = xarray.open_zarr(store, group="arrays", consolidated=False, zarr_format=3).load()
     assert dict(opened.sizes) == {
         "observation_row": 7,
         "observation": 4,
@@ -124,9 +136,68 @@ def test_xarray_opens_a_part_of_episodes_of_several_lengths(tmp_path: Path) -> N
     assert opened["rewards"].sum() == 5
 
 
-def test_the_whole_dataset_is_one_zarr_hierarchy(tiny: Dataset) -> None:
-    import zarr
+def same_array(found: np.ndarray, ours: np.ndarray) -> bool:  # type: ignore[type-arg]
+    return (found.dtype, found.shape, found.tobytes()) == (ours.dtype, ours.shape, ours.tobytes())
 
-    group = zarr.open_group(tiny.folder, mode="r", zarr_format=3)
-    array = group["tasks/00000/snapshots/step_0000100/rewards"]
-    assert np.array_equal(array[...], tiny.arrays(0, 100)["rewards"])
+
+def test_zarr_python_reads_every_array_of_a_part(tiny: Dataset) -> None:
+    ours = tiny.arrays(*PART)
+    with ZipStore(tiny.file_of(PART), mode="r") as store:
+        group = zarr.open_group(store, path="arrays", mode="r")
+        assert sorted(group.array_keys()) == sorted(ours)
+        assert list(group.group_keys()) == []
+        assert all(same_array(np.asarray(group[name]), array) for name, array in ours.items())
+
+
+def test_tensorstore_reads_every_array_of_a_part(tiny: Dataset) -> None:
+    base = f"file://{tiny.file_of(PART)}"
+    for name, array in tiny.arrays(*PART).items():
+        kvstore = {"driver": "zip", "base": base, "path": f"arrays/{name}/"}
+        found = tensorstore.open({"driver": "zarr3", "kvstore": kvstore}).result().read().result()
+        assert same_array(found, array), name
+
+
+ZARRITA = """
+import { open as openFile } from "node:fs/promises";
+import * as zarr from "zarrita";
+import ZipFileStore from "@zarrita/storage/zip";
+
+const [path, ...names] = process.argv.slice(2);
+const file = await openFile(path);
+const reader = {
+  getLength: async () => (await file.stat()).size,
+  read: async (offset, length) => {
+    const buffer = new Uint8Array(length);
+    if (length > 0) await file.read(buffer, 0, length, offset);
+    return buffer;
+  },
+};
+const group = await zarr.open(zarr.root(new ZipFileStore(reader)).resolve("arrays"), { kind: "group" });
+const found = {};
+for (const name of names) {
+  const array = await zarr.open(group.resolve(name), { kind: "array" });
+  const { data, shape } = await zarr.get(array);
+  const { buffer, byteOffset, byteLength } = data;
+  found[name] = [array.dtype, shape, Buffer.from(buffer, byteOffset, byteLength).toString("hex")];
+}
+await file.close();
+console.log(JSON.stringify(found));
+"""
+
+
+def test_zarrita_reads_every_array_of_a_part(tiny: Dataset, tmp_path: Path) -> None:
+    node = shutil.which("node")
+    modules = Path(os.environ.get("NODE_PATH", "node_modules"))
+    if node is None:
+        pytest.skip("node is not installed")
+    if not (modules / "@zarrita/storage").is_dir():
+        pytest.skip("zarrita is not installed; run `npm install zarrita @zarrita/storage`, or set NODE_PATH")
+    (tmp_path / "node_modules").symlink_to(modules.resolve())
+    (tmp_path / "read.mjs").write_text(ZARRITA)
+    ours = tiny.arrays(*PART)
+    command = [node, tmp_path / "read.mjs", tiny.file_of(PART), *ours]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert ran.returncode == 0, ran.stderr
+    assert json.loads(ran.stdout) == {
+        name: [str(array.dtype), list(array.shape), array.tobytes().hex()] for name, array in ours.items()
+    }
