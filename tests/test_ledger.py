@@ -15,12 +15,13 @@ from tcmrl_data import BuildEvent, Dataset, Recipe, load_recipe, open_dataset, r
 from tcmrl_data.build import build, ledger
 from tcmrl_data.build.unit import UnitSpec, run_unit
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError, ManifestError, TaskError
 from tcmrl_data.store import limits, manifest, tables
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.task_table import task_line
+from tcmrl_data.store.task_table import parse_tasks, task_line
 from tests.conftest import TINY
 from tests.simulated_disk import PreparedParts, at_last_part
 
@@ -281,7 +282,7 @@ def test_a_dataset_at_a_limit_is_built_and_read_and_one_beyond_is_refused_before
     }[limit]
 
     def allow(number: int) -> None:
-        for module in (limits, manifest, tables):
+        for module in (limits, manifest):
             monkeypatch.setattr(module, limit, number, raising=False)
 
     allow(largest - 1)
@@ -309,6 +310,13 @@ def test_the_limits_of_tasks_and_of_parts_are_those_that_are_stated(tmp_path: Pa
     with pytest.raises(BuildError, match="1,000,100 parts, more than the 1,000,000 that"):
         tcmrl_data.build_dataset(recipe, tmp_path / "out", tasks=range(100))
     assert not (tmp_path / "out").exists()
+
+
+def test_the_longest_line_of_a_task_that_a_writer_may_write_is_read() -> None:
+    length = limits.LINE_BYTES - len(task_line(Task(7, "train", {"text": ""})))
+    task = Task(7, "train", {"text": "x" * length})
+    assert len(task_line(task)) == limits.LINE_BYTES
+    assert parse_tasks(task_line(task), Path("tasks.jsonl")) == (task,)
 
 
 @pytest.mark.parametrize(("table", "most"), [("tasks", 100_000), ("parts", 1_000_001)])
