@@ -214,7 +214,7 @@ def build(
         print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
     else:
         click.echo(
-            f"{report.dataset}: {report.built:,} parts built, {report.present:,} already present and valid, "
+            f"{report.dataset}: {report.built:,} parts built, {report.present:,} already present, "
             f"in {duration(report.seconds)}; root {report.root[:12]}"
             f"{'; the folder cannot be written, and no write was needed' if report.read_only else ''}"
         )
