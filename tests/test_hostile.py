@@ -18,9 +18,21 @@ from tcmrl_cli.frame import run
 
 import tcmrl_data
 from tcmrl_data import TcmrlError, open_dataset, verify_dataset
+from tcmrl_data.verification import repair as repair_module
 from tcmrl_data.verification.verify import Finding
-from tests.forged_datasets import FORGED_TASKS, Forge, base
-from tests.hostile_corpus import CASES, Case
+from tests.forged_datasets import FORGED_TASKS, Forge, base, copies_of
+from tests.hostile_corpus import (
+    ARCHIVES,
+    CASES,
+    CHUNKS,
+    FILES,
+    MANIFESTS,
+    PART_TABLES,
+    PLACES,
+    RECORDS,
+    TASK_TABLES,
+    Case,
+)
 
 MEMORY_FLOOR = 64 * 2**20
 MEMORY_RATIO = 8
@@ -111,8 +123,8 @@ def resident_bytes(field: str) -> int:
 
 
 @contextlib.contextmanager
-def guarded(forge: Forge) -> Iterator[None]:
-    """Fails if code ran, a path outside was opened, a file changed, memory grew, or a command hung."""
+def bounded(forge: Forge) -> Iterator[None]:
+    """Fails if code ran, a path outside was opened, memory grew, or a command hung."""
 
     def ring(number: int, frame: FrameType | None) -> None:
         raise AssertionError(f"blocked for {SECONDS} s")
@@ -140,6 +152,14 @@ def guarded(forge: Forge) -> Iterator[None]:
     assert resident_bytes("VmHWM") - resident <= bound
     assert not forge.marker.exists(), "code of the dataset ran"
     assert [path for path in opened if Path(path).is_relative_to(forge.outside)] == []
+
+
+@contextlib.contextmanager
+def guarded(forge: Forge) -> Iterator[None]:
+    """`bounded`, and fails if a file changed."""
+    before = files_of(forge.folder.parent)
+    with bounded(forge):
+        yield
     assert files_of(forge.folder.parent) == before
 
 
@@ -179,6 +199,33 @@ WRITERS: dict[str, Callable[[Path], object]] = {
     "repair": tcmrl_data.repair_dataset,
     "gc": tcmrl_data.collect_garbage,
 }
+
+
+REPAIRED = [
+    *TASK_TABLES,
+    *PART_TABLES,
+    *PLACES,
+    *FILES,
+    *MANIFESTS[::4],
+    *ARCHIVES[::8],
+    *RECORDS[::4],
+    *CHUNKS[::4],
+]
+
+
+@pytest.mark.parametrize("case", REPAIRED, ids=lambda case: case.name.replace(" ", "-"))
+def test_a_repair_or_gc_of_a_hostile_dataset_leads_nowhere(
+    forge: Forge, case: Case, two_parts: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parts come from the sound dataset, so that no case takes the time of a training."""
+    monkeypatch.setattr(repair_module, "build_dataset", copies_of(two_parts))
+    case.damage(forge)
+    before = files_of(forge.outside)
+    with bounded(forge):
+        for command in (tcmrl_data.collect_garbage, tcmrl_data.repair_dataset):
+            with contextlib.suppress(TcmrlError):
+                command(forge.folder)
+    assert files_of(forge.outside) == before
 
 
 LINKS = {
