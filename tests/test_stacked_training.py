@@ -29,6 +29,7 @@ from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.verification.garbage import collect_garbage
+from tcmrl_data.verification.repair import repair_dataset
 from tests.datasets import part_ids
 
 TINY = (
@@ -176,6 +177,17 @@ def test_a_group_trains_its_done_tasks_again_and_leaves_their_parts_alone(
     assert {key: part for key, part in part_ids(dataset).items() if key[0] == 3} == {
         key: part for key, part in after.items() if key[0] == 3
     }
+
+
+def test_a_repaired_part_of_a_group_keeps_its_bytes(dataset: Path, tmp_path: Path) -> None:
+    """The tasks of its group train along, since their absence would change its rounding."""
+    folder = tmp_path / "damaged"
+    shutil.copytree(dataset, folder)
+    key = PartKey(2, 130)
+    (folder / part_file(key)).unlink()
+    report = repair_dataset(folder, workers=1)
+    assert (report.repaired, report.failed, report.left) == ((key,), (), ())
+    assert (folder / part_file(key)).read_bytes() == (dataset / part_file(key)).read_bytes()
 
 
 def test_gc_keeps_the_checkpoint_of_a_group_until_all_its_tasks_are_done(
