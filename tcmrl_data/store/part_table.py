@@ -76,8 +76,8 @@ _ROWS: TypeAdapter[list[tuple[Any, ...]]] = TypeAdapter(
     config=ConfigDict(strict=True, allow_inf_nan=False),
 )
 _DTYPES: dict[str, Any] = {
-    "task": np.int32,
-    "step": np.int32,
+    "task": np.int64,  # searchsorted would convert a narrower column at every look-up
+    "step": np.int64,
     "platform": np.int16,
     "size": np.int64,
     "episodes": np.int64,
