@@ -64,12 +64,12 @@ from .sampling.request import Windows as Windows
 from .sampling.sampler import Sampler as Sampler
 from .sampling.sampler import open_sampler as open_sampler
 from .store.manifest import Manifest as Manifest
+from .verification.findings import Finding as Finding
+from .verification.findings import VerifyLevel as VerifyLevel
 from .verification.garbage import Garbage as Garbage
 from .verification.garbage import collect_garbage as collect_garbage
 from .verification.repair import RepairReport as RepairReport
 from .verification.repair import repair_dataset as repair_dataset
 from .verification.replay import Replay as Replay
-from .verification.verify import Finding as Finding
-from .verification.verify import VerifyLevel as VerifyLevel
 from .verification.verify import VerifyReport as VerifyReport
 from .verification.verify import verify_dataset as verify_dataset

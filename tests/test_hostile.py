@@ -19,7 +19,7 @@ from tcmrl_cli.frame import run
 import tcmrl_data
 from tcmrl_data import TcmrlError, open_dataset, verify_dataset
 from tcmrl_data.verification import repair as repair_module
-from tcmrl_data.verification.verify import Finding
+from tcmrl_data.verification.findings import Finding
 from tests.forged_datasets import FORGED_TASKS, Forge, base, copies_of
 from tests.hostile_corpus import (
     ARCHIVES,

@@ -10,6 +10,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tracemalloc
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import FrameType
@@ -37,6 +38,7 @@ from tcmrl_data.store.keys import PARTS, PartKey, part_file, part_folder
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tcmrl_data.store.part_record import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE
+from tcmrl_data.store.tables import read_lines
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import repair as repair_module
 from tcmrl_data.verification import replay as replay_module
@@ -320,6 +322,29 @@ def test_repair_takes_links_and_pipes_away_without_following_them(tiny_copy: Cop
     }
     (folder / "parts/other").unlink()
     assert found(folder) == set()
+
+
+def test_a_part_and_its_table_damaged_together_are_repaired(tiny_copy: Copy, tiny_folder: Path) -> None:
+    """The damaged part is known by its line alone, the line that is lost by its part."""
+    folder = tiny_copy()
+    rot(folder / part_file(PartKey(3, 100)))
+    lines = (folder / PARTS_TABLE).read_bytes().splitlines(keepends=True)
+    lost = next(i for i, line in enumerate(lines) if line.startswith(b"[40,0,"))
+    (folder / PARTS_TABLE).write_bytes(b"".join([*lines[:lost], b"x" + lines[lost][1:], *lines[lost + 1 :]]))
+    report = repair_dataset(folder, workers=1)
+    assert (report.repaired, report.tables, report.left) == ((PartKey(3, 100),), (PARTS_TABLE,), ())
+    assert ids_of(folder) == ids_of(tiny_folder)
+
+
+def test_a_table_of_holes_takes_no_memory(tmp_path: Path) -> None:
+    with (tmp_path / PARTS_TABLE).open("wb") as file:
+        file.write(b"[]\n")
+        file.truncate(2**36)
+    tracemalloc.start()
+    assert read_lines(tmp_path / PARTS_TABLE, 2**36) == b"[]\n"
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 2**24
 
 
 @contextlib.contextmanager

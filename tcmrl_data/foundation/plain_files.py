@@ -2,7 +2,6 @@
 
 import os
 import stat
-import sys
 from pathlib import Path
 from typing import BinaryIO
 
@@ -45,12 +44,6 @@ def read_plain_file(file: Path, *, limit: int) -> bytes:
     """
     with open_plain_file(file, limit=limit) as opened:
         return opened.read(min(limit, os.fstat(opened.fileno()).st_size))
-
-
-def read_plain_prefix(file: Path, num_bytes: int) -> bytes:
-    """Reads the first `num_bytes` bytes of a regular file, or all of it; errors as of `read_plain_file`."""
-    with open_plain_file(file, limit=sys.maxsize) as opened:
-        return opened.read(min(num_bytes, os.fstat(opened.fileno()).st_size))
 
 
 def open_plain_file(file: Path, *, limit: int) -> BinaryIO:

@@ -6,12 +6,13 @@ them again. Readers read the sealed lines only.
 """
 
 import hashlib
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from tcmrl_data.foundation.disk import disk, named_errors
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.plain_files import one_line, read_plain_prefix
+from tcmrl_data.foundation.plain_files import one_line, open_plain_file
 from tcmrl_data.store.limits import LINE_BYTES, MAX_COUNT
 from tcmrl_data.store.manifest import TableSeal
 
@@ -25,7 +26,7 @@ def read_sealed(file: Path, seal: TableSeal) -> bytes:
     Raises:
         ManifestError: the file is missing or damaged, or is no plain file; the message names it.
     """
-    data = _read(file, seal.bytes)
+    data = read_lines(file, seal.bytes)
     found = hashlib.sha256(data).hexdigest()
     if len(data) != seal.bytes or found != seal.sha256 or data.count(b"\n") != seal.lines:
         raise ManifestError(
@@ -42,13 +43,8 @@ def seal_of(lines: bytes) -> TableSeal:
 
 
 def read_log(file: Path, seal: TableSeal) -> bytes:
-    """The complete lines behind the sealed ones.
-
-    Raises:
-        ManifestError: the file is missing, or is no plain file; the message names it.
-    """
-    data = _read(file, MAX_COUNT)[seal.bytes :]
-    return data[: data.rfind(b"\n") + 1]
+    """The complete lines behind the sealed ones; errors as of `read_lines`."""
+    return read_lines(file, MAX_COUNT)[seal.bytes :]
 
 
 def blocks(data: bytes, file: Path) -> Iterator[bytes]:
@@ -67,9 +63,20 @@ def blocks(data: bytes, file: Path) -> Iterator[bytes]:
         start = end + 1
 
 
-def _read(file: Path, num_bytes: int) -> bytes:
+def read_lines(file: Path, num_bytes: int) -> bytes:
+    """The complete lines among the first bytes of a table, up to a block without a line's end.
+
+    A file of holes thus takes no memory.
+
+    Raises:
+        ManifestError: the file is missing, or is no plain file; the message names it.
+    """
+    data = bytearray()
     try:
-        return read_plain_prefix(file, num_bytes)
+        with open_plain_file(file, limit=sys.maxsize) as opened:
+            while b"\n" in (block := opened.read(min(BLOCK_BYTES, num_bytes - len(data)))):
+                data += block
+        return bytes(data[: data.rfind(b"\n") + 1])
     except FileNotFoundError:
         raise ManifestError(f"{file} is missing; run `tcmrl-data repair`") from None
     except (OSError, ValueError) as error:

@@ -28,8 +28,9 @@ from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import Run, dataset_folder, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.verification.findings import Finding, VerifyLevel
 from tcmrl_data.verification.tables import numbered, restore_tables, write_tables
-from tcmrl_data.verification.verify import Finding, VerifyLevel, find_problems, verify_dataset
+from tcmrl_data.verification.verify import find_problems, verify_dataset
 
 REPAIR = "repair"
 """Folder in `.staging` for rebuilt parts."""

@@ -1,5 +1,6 @@
 """Writing the tables of a dataset again, from the parts or with other lines for some of them."""
 
+import contextlib
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -12,9 +13,17 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.keys import PartKey, key_of_file, part_file
 from tcmrl_data.store.manifest import MANIFEST, Manifest, seal
-from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartEntry, PartTable, parse_parts, part_line
+from tcmrl_data.store.part_table import (
+    HEADER,
+    PARTS_TABLE,
+    PartEntry,
+    PartTable,
+    parse_entries,
+    parse_parts,
+    part_line,
+)
 from tcmrl_data.store.platform import Platform
-from tcmrl_data.store.tables import read_sealed, seal_of
+from tcmrl_data.store.tables import read_lines, read_sealed, seal_of
 from tcmrl_data.store.task_table import TASKS, parse_tasks, task_line
 from tcmrl_data.verification.contents import recipe_environment
 from tcmrl_data.verification.scan import scan_dataset
@@ -31,7 +40,7 @@ def restore_tables(folder: Path, manifest: Manifest) -> None:
     try:
         table = parse_parts(read_sealed(folder / PARTS_TABLE, manifest.parts), folder / PARTS_TABLE)
     except ManifestError:
-        table = PartTable.empty().with_entries(numbered(_read_parts(folder), platforms))
+        table = _recover_parts(folder, manifest, platforms)
     try:
         tasks = parse_tasks(read_sealed(folder / TASKS, manifest.tasks), folder / TASKS)
     except ManifestError:
@@ -83,6 +92,28 @@ def numbered(parts: Iterable[Published], platforms: list[Platform]) -> list[Part
             platforms.append(part.platform)
         entries.append(part.entry._replace(platform=position))
     return entries
+
+
+def _recover_parts(folder: Path, manifest: Manifest, platforms: list[Platform]) -> PartTable:
+    """The table that has the manifest's root, of sound parts and of sound lines; any if none has it.
+
+    A damaged part stands in its line alone. A sound part without a line may not be recorded yet.
+    """
+    sound = {entry.key: entry for entry in numbered(_read_parts(folder), platforms)}
+    lines = b""
+    with contextlib.suppress(ManifestError):  # no plain file at all
+        lines = read_lines(folder / PARTS_TABLE, manifest.parts.bytes)
+    recorded = {
+        entry.key: entry
+        for line in lines.splitlines(keepends=True)
+        for entry in parse_entries(line)
+        if entry.platform < len(manifest.platforms)
+    }
+    in_lines = {key: sound.get(key, entry) for key, entry in recorded.items()}
+    choices = (recorded | sound, in_lines, sound)
+    tables = [PartTable.empty().with_entries(list(entries.values())) for entries in choices]
+    fitting = (table for table in tables if table.without_tasks(manifest.dropped).root == manifest.root)
+    return next(fitting, tables[0])
 
 
 def _read_parts(folder: Path) -> list[Published]:

@@ -6,56 +6,27 @@ parts out again. Beside a running build, a verification checks what the manifest
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
-from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.disk import LOCK, lock_holder
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.foundation.plain_files import file_problem, folder_problem, words_after
+from tcmrl_data.foundation.plain_files import file_problem, words_after
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.keys import PARTS, PartKey, key_of_file, part_file
-from tcmrl_data.store.manifest import MANIFEST, Manifest, TableSeal, dataset_folder, read_manifest
-from tcmrl_data.store.part_files import check_members, identity_problems
-from tcmrl_data.store.part_record import PartRecord, read_part_record
-from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, PartTable, parse_parts
-from tcmrl_data.store.tables import read_sealed
-from tcmrl_data.store.task_table import TASKS, parse_tasks
-from tcmrl_data.verification.contents import content_problems, task_problems
+from tcmrl_data.store.keys import PARTS, key_of_file, part_file
+from tcmrl_data.store.manifest import MANIFEST, Manifest, dataset_folder, read_manifest
+from tcmrl_data.store.part_record import read_part_record
+from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry
+from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.verification.contents import task_problems
+from tcmrl_data.verification.description import Description
+from tcmrl_data.verification.findings import Finding, VerifyLevel, finding
+from tcmrl_data.verification.part_checks import PartChecks
 from tcmrl_data.verification.replay import Replay, replay_part, spread_parts
-from tcmrl_data.verification.scan import Scan, scan_dataset
-
-VerifyLevel = Literal["quick", "digests", "deep"]
-
-
-@dataclass(frozen=True)
-class Finding:
-    """One thing that is wrong.
-
-    Attributes:
-        file: path relative to the dataset; a folder where a whole folder is meant.
-        problem: what is wrong with it.
-        task: task of the part that it belongs to.
-        step: snapshot step of that part.
-        run: run of that part.
-        foreign: it belongs to nothing that the manifest names; repair leaves it alone.
-    """
-
-    file: str
-    problem: str
-    task: int | None = None
-    step: int | None = None
-    run: str | None = None
-    foreign: bool = False
-
-    @property
-    def key(self) -> PartKey | None:
-        """The part that a finding is about; None for other files, and for foreign ones."""
-        return None if self.foreign else key_of_file(self.file)
+from tcmrl_data.verification.scan import scan_dataset
 
 
 @dataclass(frozen=True)
@@ -109,83 +80,77 @@ def verify_dataset(
     parts = run.check(progress)
     replays = run.replay(replay)
     sizes = [status.st_size for status in run.scan.files.values()]
-    return VerifyReport(
-        folder,
-        level,
-        parts,
-        len(sizes),
-        sum(sizes),
-        replays,
-        tuple(sorted(set(run.findings), key=lambda finding: (finding.file, finding.problem))),
-        time.monotonic() - started,
-    )
+    seconds = time.monotonic() - started
+    return VerifyReport(folder, level, parts, len(sizes), sum(sizes), replays, run.sorted_findings(), seconds)
 
 
 def find_problems(folder: Path, level: VerifyLevel) -> tuple[Finding, ...]:
     """What `verify_dataset` finds; for a caller that holds the dataset's lock."""
     run = _Verification(folder, level, is_locked=True)
     run.check(lambda done, total: None)
-    return tuple(sorted(set(run.findings), key=lambda finding: (finding.file, finding.problem)))
+    return run.sorted_findings()
 
 
-@dataclass
 class _Verification:
     """One run over a dataset.
 
-    Attributes:
+    Args:
+        folder: the dataset.
+        level: the checks to make.
         is_locked: this process holds the dataset's lock.
-        is_written: another process writes to the dataset, or has done so meanwhile.
-        manifest: None where it cannot be read; tables that cannot be read are empty.
-        unreadable: tables that cannot be read.
     """
 
-    folder: Path
-    level: VerifyLevel
-    is_locked: bool
-    findings: list[Finding] = field(default_factory=list)
-    unreadable: set[str] = field(default_factory=set)
-
-    def __post_init__(self) -> None:
+    def __init__(self, folder: Path, level: VerifyLevel, *, is_locked: bool) -> None:
+        self._folder, self._level, self._is_locked = folder, level, is_locked
         began_beside_a_build = self._has_writer()
-        self.manifest = self._read_manifest()
-        self.tasks, self.table = self._read_tables()
-        self.scan: Scan = scan_dataset(self.folder)
-        self.is_written = began_beside_a_build or self._has_writer() or self._was_written()
-        self._tasks_by_index = {task.index: task for task in self.tasks}
-        self._runs = {run.name: run for run in self.manifest.runs} if self.manifest else {}
-        self._settings = {
-            name: run.recipe.unit_settings() for name, run in self._runs.items() if run.recipe is not None
-        }
+        self._description = Description.of(folder)
+        self.findings = [*self._description.findings]
+        self.scan = scan_dataset(folder)
+        # another process writes to the dataset, or has done so meanwhile
+        self._is_written = began_beside_a_build or self._has_writer() or self._was_written()
+
+    def sorted_findings(self) -> tuple[Finding, ...]:
+        """What was found, each once, ordered by file."""
+        return tuple(sorted(set(self.findings), key=lambda found: (found.file, found.problem)))
 
     def check(self, progress: Callable[[int, int], None]) -> int:
         """Checks everything but replays; returns the number of parts checked."""
-        entries: dict[str, PartEntry | None] = {part_file(entry.key): entry for entry in self.table.entries()}
+        manifest = self._description.manifest
+        entries: dict[str, PartEntry | None] = {
+            part_file(entry.key): entry for entry in self._description.table.entries()
+        }
         unnamed = [file for file in self.scan.paths() if key_of_file(file) and file not in entries]
-        if self.manifest is None or PARTS_TABLE in self.unreadable:
+        if manifest is None or PARTS_TABLE in self._description.unreadable:
             entries = dict.fromkeys(unnamed)
-        elif not self.is_written:
+        elif not self._is_written:
             for file in unnamed:
-                self._add(file, self._unnamed(file), foreign=True)
+                self._add(file, _unnamed(file, manifest), foreign=True)
+        checks = PartChecks(self._folder, self._level, self._description)
+
+        def check(file: str, entry: PartEntry | None) -> list[str]:
+            return list(checks.problems(file, self.scan.files.get(file), entry))
+
         with ThreadPoolExecutor(available_cores()) as pool:
-            checked = pool.map(self._check_part, entries, entries.values())
-            for done, findings in enumerate(checked):
+            checked = zip(entries, pool.map(check, entries, entries.values()), strict=True)
+            for done, (file, problems) in enumerate(checked):
                 progress(done, len(entries))
-                self.findings += findings
+                self.findings += [finding(file, problem) for problem in problems]
         progress(len(entries), len(entries))
-        if self.level == "deep" and self.manifest is not None:
-            for problem in task_problems(self.tasks, self.manifest.recipe):
+        if self._level == "deep" and manifest is not None:
+            for problem in task_problems(self._description.tasks, manifest.recipe):
                 self._add(TASKS, problem)
         self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *entries, *unnamed})
         return len(entries)
 
     def replay(self, number: int) -> tuple[Replay, ...]:
         """Makes parts again and compares; parts with findings are left out."""
-        bad = {finding.file for finding in self.findings}
-        recipes = {name: run.recipe for name, run in self._runs.items() if run.recipe is not None}
-        keys = [key for key in self.table if part_file(key) not in bad and key.run in recipes]
+        runs = self._description.manifest.runs if self._description.manifest else ()
+        bad = {found.file for found in self.findings}
+        recipes = {run.name: run.recipe for run in runs if run.recipe is not None}
+        keys = [key for key in self._description.table if part_file(key) not in bad and key.run in recipes]
         replays = []
         for key in spread_parts(keys, number):
-            file = self.folder / part_file(key)
+            file = self._folder / part_file(key)
             try:
                 with Archive(file) as archive:
                     replay = replay_part(archive, read_part_record(archive), key, recipes[key.run])
@@ -198,148 +163,15 @@ class _Verification:
         return tuple(replays)
 
     def _has_writer(self) -> bool:
-        return not self.is_locked and lock_holder(self.folder / LOCK) is not None
+        return not self._is_locked and lock_holder(self._folder / LOCK) is not None
 
     def _was_written(self) -> bool:
         """Whether the manifest is another one than that which was read."""
+        manifest = self._description.manifest
         try:
-            return self.manifest is not None and read_manifest(self.folder).digest != self.manifest.digest
+            return manifest is not None and read_manifest(self._folder).digest != manifest.digest
         except ManifestError:
             return False
-
-    def _read_manifest(self) -> Manifest | None:
-        try:
-            return read_manifest(self.folder)
-        except ManifestError as error:
-            self._add(MANIFEST, words_after(error, self.folder / MANIFEST))
-            return None
-
-    def _read_tables(self) -> tuple[tuple[Task, ...], PartTable]:
-        """The tasks and parts that the manifest seals."""
-        tasks: tuple[Task, ...] = ()
-        table = PartTable.empty()
-        if self.manifest is not None:
-            seals: Mapping[str, TableSeal] = {TASKS: self.manifest.tasks, PARTS_TABLE: self.manifest.parts}
-            for name, seal in seals.items():
-                file = self.folder / name
-                try:
-                    data = read_sealed(file, seal)
-                    if name == TASKS:
-                        tasks = parse_tasks(data, file)
-                    else:
-                        table = parse_parts(data, file)
-                except ManifestError as error:
-                    self.unreadable.add(name)
-                    self._add(name, words_after(error, file))
-            self._check_tables(self.manifest, tasks, table)
-        return tasks, table
-
-    def _check_tables(self, manifest: Manifest, tasks: tuple[Task, ...], table: PartTable) -> None:
-        """Compares the manifest and those tables that can be read with each other."""
-        indices = {task.index for task in tasks}
-        if TASKS not in self.unreadable:
-            if not indices.issuperset(manifest.dropped):
-                self._add(MANIFEST, f"dropped names a task that {TASKS} does not have")
-            if not indices.issuperset(table.columns["task"].tolist()):
-                self._add(PARTS_TABLE, f"names a task that {TASKS} does not have")
-        if not {run.name for run in manifest.runs}.issuperset(table.runs):
-            self._add(PARTS_TABLE, "names a run that the manifest does not have")
-        if table.columns["platform"].max(initial=-1) >= len(manifest.platforms):
-            self._add(PARTS_TABLE, "names a platform that the manifest does not have")
-        if PARTS_TABLE not in self.unreadable:
-            self._check_sums(manifest, table)
-
-    def _check_sums(self, manifest: Manifest, table: PartTable) -> None:
-        """Compares the manifest's sums with the table."""
-        kept = table.without_tasks(manifest.dropped)
-        expected = {
-            "root": kept.root,
-            "totals.parts": len(kept),
-            "totals.episodes": kept.total("episodes"),
-            "totals.steps": kept.total("steps"),
-            "totals.bytes": kept.total("size"),
-            "complete": len(kept) == manifest.num_expected,
-        }
-        found = manifest.model_dump(include={"root", "totals", "complete"})
-        found |= {f"totals.{name}": value for name, value in found["totals"].items()}
-        for name, value in expected.items():
-            if found[name] != value:
-                self._add(MANIFEST, f"{name} does not agree with {PARTS_TABLE}")
-
-    def _unnamed(self, file: str) -> str:
-        """What to say of a part that no table names."""
-        key = key_of_file(file)
-        if self.manifest and key and key.task in self.manifest.dropped:
-            return (
-                "is a part of a dropped task that the manifest does not name; delete it, or build with "
-                f"--tasks {key.task}"
-            )
-        return "is a part that the manifest does not name; `tcmrl-data build` takes it in if it holds"
-
-    def _check_part(self, file: str, entry: PartEntry | None) -> list[Finding]:
-        """The findings of one part; `entry` is None where the table cannot tell."""
-        problems = list(self._part_problems(file, entry))
-        return [_finding(file, problem) for problem in problems]
-
-    def _part_problems(self, file: str, entry: PartEntry | None) -> Iterator[str]:
-        status = self.scan.files.get(file)
-        if status is None:
-            blocked = folder_problem(self.folder, file.rpartition("/")[0])
-            yield f"cannot be reached: {blocked[0]} {blocked[1]}" if blocked else "is missing"
-            return
-        odd = file_problem(status)
-        if odd is not None:
-            yield odd
-        elif entry is not None and status.st_size != entry.size:
-            yield f"has {status.st_size} bytes instead of {entry.size}"
-        elif self.level != "quick":
-            try:
-                with Archive(self.folder / file) as archive:
-                    yield from self._archive_problems(archive, entry)
-            except (StoreError, ManifestError) as error:
-                yield words_after(error, self.folder / file)
-
-    def _archive_problems(self, archive: Archive, entry: PartEntry | None) -> Iterator[str]:
-        """Problems of an archive whose directory is sound.
-
-        Raises:
-            StoreError: its members are not those of its record.
-            ManifestError: its record cannot be read.
-        """
-        if entry is None:
-            for name in archive.names:
-                archive.read(name)
-        elif archive.sha256() != entry.sha256:
-            yield "content does not have the recorded sha256"
-            return
-        record = read_part_record(archive)
-        check_members(archive, record)
-        if entry is not None:
-            yield from self._record_problems(record, entry)
-        if self.level == "deep":
-            run = self._runs.get(entry.run) if entry else None
-            for name, problem in content_problems(archive, record, run.recipe if run else None):
-                yield f"{name}: {problem}"
-
-    def _record_problems(self, record: PartRecord, entry: PartEntry) -> Iterator[str]:
-        """How a part's record differs from what the dataset says of it."""
-        assert self.manifest is not None
-        run, task = self._runs.get(entry.run), self._tasks_by_index.get(entry.task)
-        if TASKS in self.unreadable:  # a finding of its own; the part's word on its task has to do
-            task = Task(entry.task, "train", record.identity.parameters)
-        if run is None or task is None or entry.platform >= len(self.manifest.platforms):
-            yield "is of a task, a run or a platform that the dataset does not have"
-            return
-        if record.platform != self.manifest.platforms[entry.platform]:
-            yield "was made on another platform than the dataset says"
-        yield from identity_problems(
-            record,
-            entry=entry,
-            task=task,
-            run=run,
-            settings=self._settings.get(entry.run),
-            data_version=self.manifest.data_version,
-        )
 
     def _check_odd_and_foreign(self, expected: set[str]) -> None:
         """Files of other kinds (links, pipes, devices), and files that belong to nothing."""
@@ -349,24 +181,29 @@ class _Verification:
                 self._add(file, problem or "belongs to no part", foreign=True)
             elif problem and key_of_file(file) is None:
                 self._add(file, problem)
-        seals = {TASKS: self.manifest.tasks, PARTS_TABLE: self.manifest.parts} if self.manifest else {}
-        for name, seal in seals.items():
-            if not self.is_written and name in self.scan.files and self.scan.files[name].st_size > seal.bytes:
+        for name, seal in self._description.seals.items():
+            found = self.scan.files.get(name)
+            if not self._is_written and found is not None and found.st_size > seal.bytes:
                 text = "holds lines that the manifest does not seal; `tcmrl-data build` takes them in"
                 self._add(name, text, foreign=True)
         folders = {Path(file).parent for file in expected}
         used = {str(parent) for folder in folders for parent in (folder, *folder.parents)}
         for place in self.scan.empty_folders - used:
-            if not self.is_written:
+            if not self._is_written:
                 self._add(place, "is a folder that no part has", foreign=True)
         for place, problem in self.scan.problems.items():
             self._add(place, problem, foreign=place not in used)
 
     def _add(self, file: str, problem: str, *, foreign: bool = False) -> None:
-        self.findings.append(_finding(file, problem, foreign=foreign))
+        self.findings.append(finding(file, problem, foreign=foreign))
 
 
-def _finding(file: str, problem: str, *, foreign: bool = False) -> Finding:
+def _unnamed(file: str, manifest: Manifest) -> str:
+    """What to say of a part that no table names."""
     key = key_of_file(file)
-    where = {"task": key.task, "step": key.step, "run": key.run} if key else {}
-    return Finding(file, problem, **where, foreign=foreign)  # type: ignore[arg-type]
+    if key and key.task in manifest.dropped:
+        return (
+            "is a part of a dropped task that the manifest does not name; delete it, or build with "
+            f"--tasks {key.task}"
+        )
+    return "is a part that the manifest does not name; `tcmrl-data build` takes it in if it holds"
