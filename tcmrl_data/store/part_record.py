@@ -54,7 +54,8 @@ class Identity(Record):
         parameters: its parameters.
         step: snapshot step.
         seed: root seed of the build; episode seeds are keyed by (environment, task, purpose, step, episode).
-        policy: digest of the snapshot.
+            Null where it is not known.
+        policy: digest of the snapshot; null where the part holds none.
         arrays: decoded contents.
         derived: how the part was made from other parts; null for rollouts of its own policy.
     """
@@ -64,8 +65,8 @@ class Identity(Record):
     task: int = Field(ge=0, lt=MAX_INDEX)
     parameters: dict[str, Any]
     step: int = Field(ge=0, lt=MAX_INDEX)
-    seed: int = Field(ge=0)
-    policy: str = Field(pattern=SHA256)
+    seed: int | None = Field(ge=0)
+    policy: str | None = Field(pattern=SHA256)
     arrays: dict[str, ArrayRecord] = Field(max_length=MAX_ARRAYS)
     derived: dict[str, Any] | None = None
 
@@ -113,12 +114,12 @@ class References(Record):
     """Mean returns to compare results with, over the recipe's number of episodes.
 
     Attributes:
-        uniform: uniform actions.
+        uniform: uniform actions; null where it was not measured.
         oracle: a controller that knows the task; null where none can be computed.
         scripted: the environment's noise-free expert; null where there is none.
     """
 
-    uniform: float
+    uniform: float | None
     oracle: float | None
     scripted: float | None
 

@@ -57,7 +57,7 @@ class PartEntry(NamedTuple):
     min: float
     max: float
     success_rate: float | None
-    uniform: float
+    uniform: float | None
     oracle: float | None
     scripted: float | None
 
@@ -161,7 +161,7 @@ class PartTable:
         values["run"] = [self.runs[run] for run in values["run"]]
         for name in ("id", "sha256"):
             values[name] = [digest.hex() for digest in values[name]]
-        for name in ("success_rate", "oracle", "scripted"):
+        for name in ("success_rate", *REFERENCES):
             values[name] = [None if math.isnan(value) else value for value in values[name]]
         return map(PartEntry._make, zip(*(values[name] for name in PartEntry._fields), strict=True))
 

@@ -70,6 +70,8 @@ def replay_part(archive: Archive, record: PartRecord, key: PartKey, recipe: Reci
     differences: tuple[str, ...] = ()
     try:
         _check_cost(archive, record, recipe)
+        if identity.seed is None:
+            raise ValueError("its seed is not known")
         task = Task(identity.task, "train", identity.parameters)  # the split has no part in rollouts
         plan = BuildPlan.of_tasks(recipe, seed=identity.seed, tasks=[task])
         differences = tuple(plan.platform.differences(record.platform))
