@@ -13,7 +13,14 @@ from tcmrl_data.dataset.selection import Selection, chosen_parts
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.envs.trajectory import Trajectory
-from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TaskError, TrajectoryError
+from tcmrl_data.foundation.errors import (
+    ManifestError,
+    SelectionError,
+    SnapshotError,
+    StoreError,
+    TaskError,
+    TrajectoryError,
+)
 from tcmrl_data.foundation.plain_files import folder_problem
 from tcmrl_data.foundation.validation import first_problem
 from tcmrl_data.store.archive import Archive
@@ -250,8 +257,14 @@ class Dataset:
             raise StoreError(f"{file}: {error}; run `tcmrl-data repair`") from None
 
     def snapshot(self, task: int, step: int, run: str = MAIN_RUN) -> Snapshot:
-        """The behavior policy of a part."""
-        self.part(task, step, run)
+        """The behavior policy of a part.
+
+        Raises:
+            SnapshotError: the part has none, or it cannot be read.
+        """
+        if self.part(task, step, run).identity.policy is None:
+            place = self.file_of(PartKey(task, step, run))
+            raise SnapshotError(f"{place}: holds no policy, since its source does not say which one acted")
         with self.open_part(PartKey(task, step, run)) as archive:
             return read_snapshot(archive.read, step, place=str(archive.path))
 

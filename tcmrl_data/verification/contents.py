@@ -112,6 +112,8 @@ def _environment(recipe: Recipe) -> Environment | str:
 def _policy_problems(
     archive: Archive, record: PartRecord, environment: Environment | str | None
 ) -> Iterator[ContentProblem]:
+    if record.identity.policy is None:
+        return
     try:
         snapshot = read_snapshot(archive.read, record.identity.step, place=str(archive.path))
     except SnapshotError as error:
