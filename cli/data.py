@@ -1,4 +1,4 @@
-"""`tcmrl-data`: plan, build, list, inspect, verify, repair and export datasets."""
+"""`tcmrl-data`: plan, build, import, list, inspect, verify, repair and export datasets."""
 
 import dataclasses
 from pathlib import Path
@@ -10,6 +10,7 @@ from tcmrl_data.foundation.sizes import size
 from .building import build, plan
 from .cache import cache
 from .frame import main_program, make_table, output_options, print_json, print_table, remark
+from .importing import import_data
 from .inspection import inspect
 from .plugins import FORMAT
 from .progress import StageProgress
@@ -41,7 +42,20 @@ def data() -> None:
     """
 
 
-for _command in (recipe, plan, build, status, show, inspect, verify, repair, gc, import_policy, cache):
+for _command in (
+    recipe,
+    plan,
+    build,
+    status,
+    show,
+    inspect,
+    verify,
+    repair,
+    gc,
+    import_data,
+    import_policy,
+    cache,
+):
     data.add_command(_command)
 
 

@@ -39,6 +39,9 @@ from .foundation.seeding import keyed_generator as keyed_generator
 from .foundation.seeding import keyed_seed as keyed_seed
 from .foundation.sizes import parse_bytes as parse_bytes
 from .interchange.formats.base import FORMATS as FORMATS
+from .interchange.importing import ImportReport as ImportReport
+from .interchange.importing import import_dataset as import_dataset
+from .interchange.readers.base import READERS as READERS
 from .recipe.document import apply_overrides as apply_overrides
 from .recipe.listing import list_environments as list_environments
 from .recipe.profile import PROFILES as PROFILES

@@ -17,6 +17,10 @@ class RecipeError(TcmrlError):
     """A recipe, profile or `--set` override that is not valid."""
 
 
+class SimulationError(TcmrlError):
+    """An environment that cannot be simulated."""
+
+
 class TaskError(TcmrlError):
     """A task index that does not exist, or a task list that cannot be read."""
 

@@ -26,6 +26,9 @@ MANIFEST = "manifest.json"
 
 RunKind = Literal["built", "extended", "relabelled", "imported", "recorded", "subset"]
 
+FOREIGN_KINDS: tuple[RunKind, ...] = ("imported", "recorded")
+"""Runs whose episodes were not made here: nothing of them can be made again."""
+
 
 class Run(Record):
     """Parts of a dataset that were made in one way.
@@ -33,7 +36,8 @@ class Run(Record):
     Attributes:
         kind: how its parts came to be.
         seed: root seed; null where none is known.
-        recipe: what it was built from; null where nothing was built.
+        recipe: what it was built from; null where nothing was built and another run has the recipe. That of
+            imported and recorded episodes says of which environment they are, and no rollouts.
         origin: where its parts come from, if they were not built.
         steps: snapshot steps that every task is to have; null where no more is expected than there is.
     """
@@ -154,6 +158,11 @@ class Manifest(Record):
     def training(self) -> dict[Profile, dict[str, Any]]:
         """Training defaults per profile."""
         return self.recipe.training
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether the recipe drew the tasks; those of a foreign dataset are as its source has them."""
+        return self.runs[0].kind not in FOREIGN_KINDS
 
     @property
     def num_tasks(self) -> int:

@@ -143,7 +143,8 @@ def _shape_problems(
     arrays: Mapping[str, npt.NDArray[Any]], recipe: Recipe, environment: Environment | str
 ) -> Iterator[ContentProblem]:
     episodes = len(arrays["episode_offsets"]) - 1
-    if episodes != recipe.rollouts.episodes:
+    is_built = recipe.rollouts.episodes > 0
+    if is_built and episodes != recipe.rollouts.episodes:
         yield "episode_offsets", f"{episodes} episodes, not the recipe's {recipe.rollouts.episodes}"
     if isinstance(environment, str):
         yield RECORD, environment
@@ -153,7 +154,7 @@ def _shape_problems(
             yield name, f"have {arrays[name].shape[1]} columns, {environment.name} has {width}"
     extras = {name: str(array.dtype) for name, array in arrays.items() if name not in STANDARD_ARRAYS}
     wanted = {name: str(np.dtype(dtype)) for name, dtype in environment.extras.items()}
-    if extras != wanted:
+    if extras != wanted and (is_built or not extras.items() <= wanted.items()):
         yield RECORD, f"extra arrays {extras} are not the environment's {wanted}"
     longest = int(np.diff(arrays["episode_offsets"]).max(initial=0))
     if longest > environment.settings.horizon:

@@ -99,7 +99,15 @@ def _read_parts(folder: Path) -> list[Published]:
 
 
 def _draw_again(table: PartTable, manifest: Manifest) -> tuple[Task, ...]:
-    """The tasks of the parts and of the recipe's choice, as the recipe draws them."""
+    """The tasks of the parts and of the recipe's choice, as the recipe draws them.
+
+    Raises:
+        BuildError: the tasks are not the recipe's.
+    """
+    if not manifest.is_drawn:
+        raise BuildError(
+            f"{TASKS} is damaged, and nobody can draw the tasks of foreign data; import or record them again"
+        )
     recipe = manifest.recipe
     present = set(table.columns["task"].tolist())
     if len(present) < manifest.tasks.lines:

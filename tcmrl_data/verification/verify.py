@@ -20,7 +20,15 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem, words_after
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PARTS, PartKey, key_of_file, part_file
-from tcmrl_data.store.manifest import MANIFEST, Manifest, Run, TableSeal, dataset_folder, read_manifest
+from tcmrl_data.store.manifest import (
+    FOREIGN_KINDS,
+    MANIFEST,
+    Manifest,
+    Run,
+    TableSeal,
+    dataset_folder,
+    read_manifest,
+)
 from tcmrl_data.store.part_files import check_members, identity_problems
 from tcmrl_data.store.part_record import PartRecord, read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, PartTable, parse_parts
@@ -171,7 +179,7 @@ class _Verification:
                 progress(done, len(entries))
                 self.findings += findings
         progress(len(entries), len(entries))
-        if self.level == "deep" and self.manifest is not None:
+        if self.level == "deep" and self.manifest is not None and self.manifest.is_drawn:
             for problem in task_problems(self.tasks, self.manifest.recipe):
                 self._add(TASKS, problem)
         self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *entries, *unnamed})
@@ -180,7 +188,7 @@ class _Verification:
     def replay(self, number: int) -> tuple[Replay, ...]:
         """Makes parts again and compares; parts with findings are left out."""
         bad = {finding.file for finding in self.findings}
-        keys = [key for key in self.table if part_file(key) not in bad and self._run(key).recipe is not None]
+        keys = [key for key in self.table if part_file(key) not in bad and self._can_replay(key)]
         replays = []
         for key in spread_parts(keys, number):
             recipe = self._run(key).recipe
@@ -191,6 +199,10 @@ class _Verification:
             for problem in replay.problems:
                 self._add(part_file(key), f"replay: {problem}")
         return tuple(replays)
+
+    def _can_replay(self, key: PartKey) -> bool:
+        run = self._run(key)
+        return run.recipe is not None and run.kind not in FOREIGN_KINDS
 
     def _has_writer(self) -> bool:
         return not self.is_locked and lock_holder(self.folder / LOCK) is not None
