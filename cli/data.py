@@ -9,6 +9,7 @@ from tcmrl_data.foundation.sizes import size
 
 from .building import build, plan
 from .cache import cache
+from .curation import derive
 from .frame import main_program, make_table, output_options, print_json, print_table, remark
 from .importing import import_data
 from .inspection import inspect
@@ -55,6 +56,7 @@ for _command in (
     import_data,
     import_policy,
     cache,
+    derive,
 ):
     data.add_command(_command)
 
@@ -145,7 +147,7 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
     default="all",
     show_default=True,
     metavar="RULE",
-    help="Snapshots to export: all, last, steps>=N, or return>=Q with a quantile Q.",
+    help="Snapshots to export: all, last, steps>=N, return>=Q with a quantile Q, or tier:NAME.",
 )
 @output_options
 def export(
@@ -166,8 +168,8 @@ def export(
 
     exporter = tcmrl_data.FORMATS.get(format_name)()
     opened = tcmrl_data.open_dataset(dataset)
-    folder = opened.folder if opened.folder.name not in ("", "..") else opened.folder.resolve()
-    target = out or folder.with_name(f"{folder.name}-{format_name}")
+    place = opened.path if opened.path.name not in ("", "..") else opened.path.resolve()
+    target = out or place.with_name(f"{place.stem if place.is_file() else place.name}-{format_name}")
     with StageProgress(quiet=quiet) as progress:
         files = exporter.export(
             opened,

@@ -9,11 +9,14 @@ from .build.forecast import Forecast as Forecast
 from .build.forecast import forecast_build as forecast_build
 from .build.plan import BuildPlan as BuildPlan
 from .build.plan import plan_build as plan_build
+from .curation.derive import Derived as Derived
+from .curation.derive import derive_dataset as derive_dataset
 from .dataset.dataset import Dataset as Dataset
 from .dataset.dataset import open_dataset as open_dataset
 from .dataset.listing import list_datasets as list_datasets
 from .dataset.returns import return_table as return_table
 from .dataset.selection import Selection as Selection
+from .dataset.tiers import TIERS as TIERS
 from .engine.base import ENGINES as ENGINES
 from .envs.base import ENVIRONMENTS as ENVIRONMENTS
 from .envs.base import Environment as Environment
@@ -32,6 +35,7 @@ from .foundation.canonical import parse_json as parse_json
 from .foundation.errors import CheckpointError as CheckpointError
 from .foundation.errors import SelectionError as SelectionError
 from .foundation.errors import TcmrlError as TcmrlError
+from .foundation.errors import TierError as TierError
 from .foundation.errors import TrainingError as TrainingError
 from .foundation.seeding import NO_TASK as NO_TASK
 from .foundation.seeding import Purpose as Purpose
@@ -66,6 +70,7 @@ from .sampling.request import Transitions as Transitions
 from .sampling.request import Windows as Windows
 from .sampling.sampler import Sampler as Sampler
 from .sampling.sampler import open_sampler as open_sampler
+from .store.limits import MAX_TASKS as MAX_TASKS
 from .store.manifest import Manifest as Manifest
 from .verification.garbage import Garbage as Garbage
 from .verification.garbage import collect_garbage as collect_garbage

@@ -10,23 +10,33 @@ from typing import Any
 
 from tcmrl_data.build.published import Published, read_published
 from tcmrl_data.build.work_files import ASSEMBLY, check_work_files
-from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.canonical import canonical_json, sha256
-from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, make_folders, remove_abandoned, replace_file
+from tcmrl_data.foundation.disk import (
+    LOCK,
+    STAGING,
+    lock_file,
+    make_folders,
+    place_file,
+    remove_abandoned,
+    replace_file,
+    sync_files,
+)
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.foundation.ranges import write_ranges
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.limits import MAX_PARTS
-from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, Run, Source, read_manifest
+from tcmrl_data.store.manifest import Derivation, Manifest, Run, Source
 from tcmrl_data.store.part_record import PartRecord
 from tcmrl_data.store.part_table import PartEntry, PartTable
 from tcmrl_data.store.platform import Platform
 from tcmrl_data.store.sealing import write_dataset
 
-WRITERS = 8
-"""Parts that are written side by side; a disk makes several durable in the time of one."""
+WRITERS = 4
+"""Parts that are copied side by side."""
 
 
 @dataclass(frozen=True)
@@ -54,27 +64,41 @@ class Copied:
         return self.source.manifest.platforms[self.entry.platform]
 
 
-def derivation_of(operation: str, settings: Mapping[str, Any], sources: Sequence[Dataset]) -> Derivation:
+def derivation_of(
+    operation: str,
+    settings: Mapping[str, Any],
+    sources: Sequence[Dataset],
+    *,
+    splits: Mapping[int, Split] | None = None,
+) -> Derivation:
     """What the manifest of a derived dataset says of how it was made.
 
     Args:
         operation: such as `subset` or `merge`.
         settings: JSON values that the result follows from, together with the sources.
         sources: the datasets that it is made from.
+        splits: of tasks whose split is not as the recipe draws it; None takes them over from the sources.
     """
+    if splits is None:
+        derivations = [source.manifest.derivation for source in sources]
+        splits = dict(item for found in derivations if found for item in found.split_of_tasks().items())
+    names: tuple[Split, ...] = ("train", "test")
+    members = {name: [task for task, split in splits.items() if split == name] for name in names}
     return Derivation(
         operation=operation,
         settings=dict(settings),
         sources=tuple(Source(label=source.manifest.label, root=source.manifest.root) for source in sources),
         package=version("tcmrl"),
+        splits={name: write_ranges(tasks) for name, tasks in members.items()} if splits else None,
     )
 
 
 class Assembly:
     """A new dataset that is put together from parts; it exists when its manifest does.
 
-    Parts are published one by one and survive a crash. The same command, given again, finds them and goes on.
-    The folder is locked while the assembly is open.
+    Parts are written one by one; copies are forced to disk together before the manifest is written. The same
+    command, given again after a crash, finds sound parts and goes on. The folder is locked while the assembly
+    is open.
 
     Args:
         out: the new dataset's folder: free, empty, or one where the same assembly was stopped.
@@ -95,6 +119,7 @@ class Assembly:
         self._out, self._derivation, self._sources = out, derivation, tuple(sources)
         self._entries: list[PartEntry] = []
         self._platforms: list[Platform] = []
+        self._copied: list[Path] = []
 
     def holds(self, key: PartKey) -> bool:
         """Whether a part was published before, by an attempt that was stopped."""
@@ -116,10 +141,12 @@ class Assembly:
             StoreError: a part of a source is missing or damaged; the message names it.
             StorageError: the operating system refuses an operation.
         """
+        make_folders(self._out / STAGING)
         with ThreadPoolExecutor(WRITERS) as pool:
-            for done, part in enumerate(pool.map(self._copy, parts), start=1):
-                self._add(part.entry._replace(run=part.key.run), part.platform)
+            for done, entry in enumerate(pool.map(self._copy, parts), start=1):
+                self._add(entry, parts[done - 1].platform)
                 progress(done, len(parts))
+        self._copied += [self._out / part_file(part.key) for part in parts]
 
     def write(self, key: PartKey, make: Callable[[], tuple[PartRecord, bytes]]) -> PartEntry:
         """Publishes a new part, unless an attempt that was stopped has done so.
@@ -161,12 +188,13 @@ class Assembly:
             StoreError: a source has changed since it was opened, or no part is left.
         """
         for source in self._sources:
-            if read_manifest(source.folder).digest != source.manifest.digest:
-                raise StoreError(f"{source.folder} has changed meanwhile; run the same command again")
+            if open_dataset(source.path).manifest.digest != source.manifest.digest:
+                raise StoreError(f"{source.path} has changed meanwhile; run the same command again")
         if not 0 < len(self._entries) <= MAX_PARTS:
             raise StoreError(
                 f"{self._out} would have {len(self._entries)} parts; 1 to {MAX_PARTS} are possible"
             )
+        sync_files(self._out, self._copied)
         manifest = write_dataset(
             self._out,
             name=name,
@@ -181,54 +209,68 @@ class Assembly:
         (self._out / ASSEMBLY).unlink()
         return manifest
 
-    def _copy(self, part: Copied) -> Copied:
-        target = self._out / part_file(part.key)
-        entry = part.entry
-        if not target.is_file() or target.lstat().st_size != entry.size:
-            file = part.source.file_of(part.source_key)
+    def _copy(self, part: Copied) -> PartEntry:
+        """Copies a part unless it is there; returns its line."""
+        target, entry = self._out / part_file(part.key), part.entry
+        if not _holds(target, entry):
             with part.source.open_part(part.source_key) as archive:
                 data = archive.content()
             if sha256(data) != entry.sha256:
+                file = part.source.file_of(part.source_key)
                 raise StoreError(f"{file} does not have the recorded sha256; run `tcmrl-data repair`")
-            replace_file(target, data, staging=self._out / STAGING)
-        return part
+            place_file(target, data, staging=self._out / STAGING)
+        return entry._replace(run=part.key.run)
 
     def _add(self, entry: PartEntry, platform: Platform) -> PartEntry:
-        digests = [known.digest() for known in self._platforms]
-        if platform.digest() not in digests:
+        if platform not in self._platforms:
             self._platforms.append(platform)
-            digests.append(platform.digest())
-        entry = entry._replace(platform=digests.index(platform.digest()))
+        entry = entry._replace(platform=self._platforms.index(platform))
         self._entries.append(entry)
         return entry
+
+
+def _holds(file: Path, entry: PartEntry) -> bool:
+    """Whether a part is in its place; after a crash its file may hold anything."""
+    if not file.is_file():
+        return False
+    try:
+        return sha256(read_plain_file(file, limit=entry.size)) == entry.sha256
+    except (OSError, ValueError):
+        return False
 
 
 @contextlib.contextmanager
 def open_assembly(out: Path, derivation: Derivation, sources: Sequence[Dataset]) -> Iterator[Assembly]:
     """Begins an assembly, or goes on with one that was stopped; arguments and errors as of `Assembly`."""
-    note = canonical_json(derivation.model_dump(mode="json"))
-    _check_out(out, note)
+    check_out(out, derivation)
     make_folders(out)
     with lock_file(out / LOCK, f"dataset {out}"):
-        _check_out(out, note)
+        check_out(out, derivation)
         remove_abandoned(out)
-        replace_file(out / ASSEMBLY, note, staging=out / STAGING)
+        replace_file(out / ASSEMBLY, _note(derivation), staging=out / STAGING)
         yield Assembly(out, derivation, sources)
 
 
-def _check_out(out: Path, note: bytes) -> None:
-    """Refuses a folder that is neither new nor one where the same assembly was stopped."""
+def check_out(out: Path, derivation: Derivation) -> None:
+    """Refuses a folder that is neither new nor one where the same assembly was stopped.
+
+    Raises:
+        StoreError: it is not; the message names it.
+        BuildError: its work files are links.
+    """
     if not out.exists():
         return
     if not out.is_dir():
         raise StoreError(f"--out {out} is a file; choose another folder")
     check_work_files(out)
     begun = out / ASSEMBLY
-    if (out / MANIFEST).exists() or (
-        {entry.name for entry in out.iterdir()} - {LOCK, STAGING} and not begun.exists()
-    ):
+    if not begun.exists() and {entry.name for entry in out.iterdir()} - {LOCK, STAGING}:
         raise StoreError(f"--out {out} exists and is not empty; choose another folder or remove it")
-    if begun.exists() and read_plain_file(begun, limit=LARGEST_ARCHIVE) != note:
+    if begun.exists() and read_plain_file(begun, limit=LARGEST_ARCHIVE) != _note(derivation):
         raise StoreError(
             f"--out {out} holds the beginning of another dataset; choose another folder or remove it"
         )
+
+
+def _note(derivation: Derivation) -> bytes:
+    return canonical_json(derivation.model_dump(mode="json"))

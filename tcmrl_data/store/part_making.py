@@ -37,6 +37,7 @@ def make_part(
     behavior: Mapping[str, Any] | None = None,
     platform: Platform = UNKNOWN,
     derived: Mapping[str, Any] | None = None,
+    data_version: int = DATA_VERSION,
 ) -> tuple[PartRecord, bytes]:
     """The record and the archive of a part.
 
@@ -51,10 +52,11 @@ def make_part(
         behavior: what the behavior source records with its parts.
         platform: on which the episodes were made.
         derived: how the part was made from others: `operation`, `from` (ids of parts) and `settings`.
+        data_version: of the code that made the episodes.
     """
     arrays = pack(trajectories)
     identity = Identity(
-        data_version=DATA_VERSION,
+        data_version=data_version,
         settings=dict(settings),
         task=task.index,
         parameters=dict(task.parameters),

@@ -181,6 +181,14 @@ class PartTable:
         kept = ~np.isin(self.columns["task"], list(tasks))
         return PartTable(self.runs, {name: column[kept] for name, column in self.columns.items()})
 
+    def only(self, keys: Collection[PartKey]) -> "PartTable":
+        """The table of some of its parts; keys that it does not have count for nothing."""
+        kept = np.fromiter((key in keys for key in self), dtype=np.bool_, count=len(self))
+        used = np.unique(self.columns["run"][kept])
+        columns = {name: column[kept] for name, column in self.columns.items()}
+        columns["run"] = np.searchsorted(used, columns["run"]).astype(np.int32)
+        return PartTable([self.runs[run] for run in used], columns)
+
     @functools.cached_property
     def root(self) -> str:
         """sha256 over all parts, sorted by task, step and run.

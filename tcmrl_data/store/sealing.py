@@ -21,6 +21,16 @@ from tcmrl_data.store.tables import seal_of
 from tcmrl_data.store.task_table import TASKS, task_line
 
 
+def totals_of(table: PartTable) -> Totals:
+    """The sums over the parts of a table."""
+    return Totals(
+        parts=len(table),
+        episodes=table.total("episodes"),
+        steps=table.total("steps"),
+        bytes=table.total("size"),
+    )
+
+
 def write_dataset(
     folder: Path,
     *,
@@ -56,12 +66,6 @@ def write_dataset(
         PARTS_TABLE: HEADER + b"".join(map(part_line, table.entries())),
     }
     kept = table.without_tasks(dropped)
-    totals = Totals(
-        parts=len(kept),
-        episodes=kept.total("episodes"),
-        steps=kept.total("steps"),
-        bytes=kept.total("size"),
-    )
     planned = [run.steps for run in runs if run.steps is not None]
     expected = sum(map(len, planned)) * (len(tasks) - len(dropped)) if planned else len(kept)
     fields = {
@@ -75,7 +79,7 @@ def write_dataset(
         "tasks": seal_of(tables[TASKS]).model_dump(),
         "parts": seal_of(tables[PARTS_TABLE]).model_dump(),
         "dropped": sorted(dropped),
-        "totals": totals.model_dump(),
+        "totals": totals_of(kept).model_dump(),
         "root": kept.root,
         "complete": len(kept) == expected,
     }

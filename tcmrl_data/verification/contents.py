@@ -54,7 +54,9 @@ def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None
     problems = list(_value_problems(arrays))
     yield from problems
     if recipe is not None and environment is not None:
-        yield from _shape_problems(arrays, recipe, environment)
+        yield from _shape_problems(
+            arrays, recipe, environment, is_derived=record.identity.derived is not None
+        )
     try:
         episodes = unpack(arrays)
     except (StoreError, TrajectoryError) as error:
@@ -140,11 +142,16 @@ def _value_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[ContentP
 
 
 def _shape_problems(
-    arrays: Mapping[str, npt.NDArray[Any]], recipe: Recipe, environment: Environment | str
+    arrays: Mapping[str, npt.NDArray[Any]],
+    recipe: Recipe,
+    environment: Environment | str,
+    *,
+    is_derived: bool,
 ) -> Iterator[ContentProblem]:
+    """Differences from what the recipe calls for; derived parts may lack episodes and extra arrays."""
     episodes = len(arrays["episode_offsets"]) - 1
-    is_built = recipe.rollouts.episodes > 0
-    if is_built and episodes != recipe.rollouts.episodes:
+    is_whole = recipe.rollouts.episodes > 0 and not is_derived
+    if is_whole and episodes != recipe.rollouts.episodes:
         yield "episode_offsets", f"{episodes} episodes, not the recipe's {recipe.rollouts.episodes}"
     if isinstance(environment, str):
         yield RECORD, environment
@@ -154,7 +161,7 @@ def _shape_problems(
             yield name, f"have {arrays[name].shape[1]} columns, {environment.name} has {width}"
     extras = {name: str(array.dtype) for name, array in arrays.items() if name not in STANDARD_ARRAYS}
     wanted = {name: str(np.dtype(dtype)) for name, dtype in environment.extras.items()}
-    if extras != wanted and (is_built or not extras.items() <= wanted.items()):
+    if extras != wanted and (is_whole or not extras.items() <= wanted.items()):
         yield RECORD, f"extra arrays {extras} are not the environment's {wanted}"
     longest = int(np.diff(arrays["episode_offsets"]).max(initial=0))
     if longest > environment.settings.horizon:

@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from tcmrl_data.dataset.dataset import open_dataset
+from tcmrl_data.dataset.view import is_view_file
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import LOCK, lock_holder
@@ -111,6 +113,9 @@ def verify_dataset(
         ()
     """
     started = time.monotonic()
+    if is_view_file(path):
+        source = open_dataset(path).folder
+        raise ManifestError(f"{path} is a sound view of {source}; verify that dataset, which holds the parts")
     folder = dataset_folder(path)
     if not folder.is_dir() or not any((folder / name).exists() for name in (MANIFEST, PARTS)):
         raise ManifestError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
@@ -202,7 +207,7 @@ class _Verification:
 
     def _can_replay(self, key: PartKey) -> bool:
         run = self._run(key)
-        return run.recipe is not None and run.kind not in FOREIGN_KINDS
+        return run.recipe is not None and run.kind not in (*FOREIGN_KINDS, "subset")
 
     def _has_writer(self) -> bool:
         return not self.is_locked and lock_holder(self.folder / LOCK) is not None

@@ -85,7 +85,7 @@ class MinariFormat(Format):
 
 def dataset_id(dataset: Dataset, task: int, snapshots: str = "all") -> str:
     """The name of a task's Minari dataset; a rule's `>=` and `.` become `-ge-` and `_`."""
-    rule = snapshots.replace(" ", "").replace(">=", "-ge-").replace(".", "_")
+    rule = snapshots.replace(" ", "").replace(">=", "-ge-").replace(".", "_").replace(":", "-")
     return f"tcmrl/{dataset.name}/task{task:05d}-{rule}-v0"
 
 
