@@ -11,7 +11,8 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.interchange.readers.base import ReadPart
 from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.limits import MAX_INDEX
+from tcmrl_data.store.limits import MAX_ARRAYS, MAX_INDEX
+from tcmrl_data.store.part_record import STANDARD_ARRAYS
 
 
 @dataclass
@@ -75,6 +76,10 @@ class Survey:
             found = self.named_types({name: array.dtype for name, array in trajectory.extras.items()})
             before = found if self._extras is None else self._extras
             self._extras = dict(found.items() & before.items())
+            if len(self._extras) > MAX_ARRAYS - len(STANDARD_ARRAYS):
+                raise StoreError(
+                    f"{key}: has {len(found)} further arrays, a part has at most {MAX_ARRAYS} in all"
+                )
 
     @staticmethod
     def named_types(types: Mapping[str, Any]) -> dict[str, str]:

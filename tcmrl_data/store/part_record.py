@@ -32,7 +32,7 @@ STANDARD_ARRAYS = {
 }
 """dtype and rank of the arrays of every part; an environment's extra arrays have rank 1."""
 
-_ARRAY_NAME = r"[a-z0-9_]{1,64}"
+ARRAY_NAME = r"[a-z0-9_]{1,64}"
 
 
 class ArrayRecord(Record):
@@ -81,7 +81,7 @@ class Identity(Record):
         steps, episodes = arrays["actions"].shape[0], arrays["episode_offsets"].shape[0] - 1
         rows = {"observations": steps + episodes, "episode_offsets": episodes + 1}
         for name, record in arrays.items():
-            if not re.fullmatch(_ARRAY_NAME, name):
+            if not re.fullmatch(ARRAY_NAME, name):
                 raise ValueError(f"{name[:80]!r} is no array name")
             if name not in STANDARD_ARRAYS and len(record.shape) != 1:
                 raise ValueError(f"{name} must be of rank 1")

@@ -1,6 +1,8 @@
 """Episodes from rows as other libraries store them."""
 
-from collections.abc import Mapping
+import itertools
+import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,8 +11,11 @@ import numpy.typing as npt
 
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import StoreError, TrajectoryError
+from tcmrl_data.store.part_record import ARRAY_NAME, STANDARD_ARRAYS
 
 Array = npt.NDArray[Any]
+
+_NAME = re.compile(ARRAY_NAME)
 
 
 @dataclass
@@ -178,16 +183,43 @@ def last_flags(terminated: Array, truncated: Array | None, place: str) -> tuple[
     return found[0], found[1]
 
 
-def extra_array(values: Array) -> Array | None:
-    """A further per-step array in a type that a part may have; None where it is none.
+def extras_of(arrays: Mapping[str, Array]) -> dict[str, Array]:
+    """The further per-step arrays that a part may have: of numbers, of rank 1, with a name of its kind.
 
-    Floats become float32, integers int64.
+    Floats become float32, integers int64; what is not finite as float32 is left out.
     """
-    if values.ndim != 1 or values.dtype.kind not in "biuf":
-        return None
-    kind = values.dtype.kind
-    made: Array = values.astype({"b": np.bool_, "f": np.float32}.get(kind, np.int64))
-    return made if kind != "f" or np.isfinite(made).all() else None
+    kept = {}
+    for name, values in arrays.items():
+        kind = values.dtype.kind
+        if values.ndim != 1 or kind not in "biuf" or name in STANDARD_ARRAYS or not _NAME.fullmatch(name):
+            continue
+        with np.errstate(over="ignore"):
+            made: Array = values.astype({"b": np.bool_, "f": np.float32}.get(kind, np.int64))
+        if np.isfinite(made).all():
+            kept[name] = made
+    return kept
+
+
+def parts_by_step(
+    episodes: Iterable[tuple[int, Trajectory]], *, place: str
+) -> Iterator[tuple[int, list[Trajectory]]]:
+    """Episodes of equal snapshot steps together; they must stand behind one another.
+
+    Args:
+        episodes: steps and episodes, in the order of the file.
+        place: the file, for error messages.
+
+    Raises:
+        StoreError: there is no episode, or a step comes back after another one.
+    """
+    done: set[int] = set()
+    for step, group in itertools.groupby(episodes, key=lambda pair: pair[0]):
+        if step in done:
+            raise StoreError(f"{place}: the episodes of step {step} do not stand behind one another")
+        done.add(step)
+        yield step, [trajectory for _, trajectory in group]
+    if not done:
+        raise StoreError(f"{place}: holds no episode")
 
 
 def _flags(values: Array, rows: int, place: str) -> npt.NDArray[np.bool_]:

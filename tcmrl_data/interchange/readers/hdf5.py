@@ -27,7 +27,14 @@ from tcmrl_data.interchange.readers.base import (
     Say,
     say_nothing,
 )
-from tcmrl_data.interchange.readers.episodes import Cuts, episode, episodes_of_rows, extra_array, last_flags
+from tcmrl_data.interchange.readers.episodes import (
+    Cuts,
+    episode,
+    episodes_of_rows,
+    extras_of,
+    last_flags,
+    parts_by_step,
+)
 from tcmrl_data.interchange.readers.hdf5_file import Hdf5File
 from tcmrl_data.interchange.readers.source_files import require_file
 from tcmrl_data.store.limits import MAX_INDEX
@@ -114,22 +121,10 @@ def _read_ours(file: Hdf5File, cuts: Cuts) -> Iterator[ReadPart]:
     if version != FORMAT_VERSION:
         raise StoreError(f"{file.path}: format_version {version} is not {FORMAT_VERSION}, which is read here")
     task, about = _index(file, "/", "task"), _about(file)
-    step, trajectories = None, []
-    done: set[int] = set()
-    for name in file.members("/episodes"):
-        group = f"/episodes/{name}"
-        found = _index(file, group, "step")
-        if step is not None and found != step:
-            yield ReadPart(task, step, trajectories, about)
-            done.add(step)
-            trajectories = []
-        if found in done:
-            raise StoreError(f"{file.path}: {group} stands apart from the other episodes of step {found}")
-        step = found
-        trajectories.append(_our_episode(file, group, cuts))
-    if step is None:
-        raise StoreError(f"{file.path}: /episodes holds none")
-    yield ReadPart(task, step, trajectories, about)
+    groups = (f"/episodes/{name}" for name in file.members("/episodes"))
+    episodes = ((_index(file, group, "step"), _our_episode(file, group, cuts)) for group in groups)
+    for step, trajectories in parts_by_step(episodes, place=str(file.path)):
+        yield ReadPart(task, step, trajectories, about)
 
 
 def _our_episode(file: Hdf5File, group: str, cuts: Cuts) -> Trajectory:
@@ -140,7 +135,7 @@ def _our_episode(file: Hdf5File, group: str, cuts: Cuts) -> Trajectory:
         raise StoreError(f"{place}/{missing[0]} is missing")
     observations, actions, rewards, terminated, truncated = (arrays.pop(name) for name in EPISODE_ARRAYS)
     ended = last_flags(terminated, truncated, place)
-    extras = {name: made for name, array in arrays.items() if (made := extra_array(array)) is not None}
+    extras = extras_of(arrays)
     return episode(observations, actions, rewards, ended=ended, extras=extras, cuts=cuts, place=place)
 
 

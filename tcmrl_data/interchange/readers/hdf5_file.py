@@ -111,6 +111,12 @@ class Hdf5File:
             found = self._object(path)
             return len(found.shape or ()) if isinstance(found, h5py.Dataset) else None
 
+    def length(self, path: str) -> int:
+        """Number of rows of a dataset; 0 where there is none."""
+        with self._named(path):
+            found = self._object(path)
+            return int(found.shape[0]) if isinstance(found, h5py.Dataset) and found.shape else 0
+
     def array(self, path: str) -> npt.NDArray[Any]:
         """The values of a dataset, in the machine's byte order."""
         with self._named(path):
