@@ -1,5 +1,5 @@
 from .behavior.base import BEHAVIOR_SOURCES as BEHAVIOR_SOURCES
-from .behavior.snapshot import import_sac as import_sac
+from .behavior.sb3_zip import import_sac as import_sac
 from .build.build import BuildReport as BuildReport
 from .build.build import build_dataset as build_dataset
 from .build.events import BuildEvent as BuildEvent
