@@ -1,9 +1,9 @@
-"""`tcmrl-data derive`: datasets made of datasets."""
+"""`tcmrl-data derive`, `merge`, `split`, `rename` and `delete`."""
 
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, TypeVar
 
 import click
 
@@ -16,6 +16,9 @@ from .progress import StageProgress
 
 if TYPE_CHECKING:
     from tcmrl_data import Derived
+
+Made = TypeVar("Made")
+Progress = Callable[[int, int], None]
 
 TIERS = ("random", "medium", "medium-replay", "expert", "medium-expert", "random-expert", "mixed")
 SOURCE = click.argument("dataset", type=click.Path(path_type=Path))
@@ -96,7 +99,7 @@ def derive(
     import tcmrl_data
     from tcmrl_data.curation.derive import describe_far
 
-    def make(progress: Callable[[int, int], None]) -> "Derived":
+    def make(progress: Progress) -> "Derived":
         return tcmrl_data.derive_dataset(
             dataset,
             out,
@@ -126,7 +129,174 @@ def derive(
     _print([made], as_json=as_json, dry_run=dry_run)
 
 
-def _run(make: "Callable[[Callable[[int, int], None]], Any]", out: Path, stage: str, *, quiet: bool) -> Any:
+@click.command()
+@click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, metavar="FOLDER", help="Folder to create."
+)
+@click.option(
+    "--as",
+    "names",
+    multiple=True,
+    metavar="NAME",
+    help="Name of a dataset's run in the union; give one per dataset, in order.",
+)
+@click.option(
+    "--split-from",
+    type=click.Path(path_type=Path),
+    metavar="DATASET",
+    help="The dataset that decides which tasks are training tasks.",
+)
+@LABEL
+@DRY_RUN
+@output_options
+def merge(
+    datasets: tuple[Path, ...],
+    out: Path,
+    names: tuple[str, ...],
+    split_from: Path | None,
+    label: str | None,
+    dry_run: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Make the union of DATASETS, which are of one environment.
+
+    Their order does not matter. A part that several of them hold is taken once. Parts with equal keys and
+    different contents, such as those of other seeds, become another run.
+
+    \b
+    Examples:
+      tcmrl-data merge data/pr-seed0 data/pr-seed1 --out data/pr-two-seeds
+      tcmrl-data merge data/a data/b --as first --as second --out data/both
+    """
+    import tcmrl_data
+
+    def make(progress: Progress) -> "Derived":
+        return tcmrl_data.merge_datasets(
+            datasets,
+            out,
+            names=names or None,
+            split_from=split_from,
+            label=label,
+            dry_run=dry_run,
+            progress=progress,
+        )
+
+    made = _run(make, out, "merge", quiet=quiet)
+    _print([made], as_json=as_json, dry_run=dry_run)
+
+
+@click.command()
+@SOURCE
+@click.option(
+    "--out", type=click.Path(path_type=Path), required=True, metavar="FOLDER", help="Folder to fill."
+)
+@click.option("--folds", type=click.IntRange(min=2), metavar="K", help="Make K folds of the tasks.")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Draws the folds.")
+@click.option("--episodes", metavar="LIST", help="Split every part by episodes, such as 45,5.")
+@click.option("--names", metavar="LIST", help="Names of the new datasets, such as fit,holdout.")
+@click.option("--views", is_flag=True, help="Make a view file per fold instead of copies.")
+@DRY_RUN
+@output_options
+def split(
+    dataset: Path,
+    out: Path,
+    folds: int | None,
+    seed: int,
+    episodes: str | None,
+    names: str | None,
+    views: bool,
+    dry_run: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Make several datasets of DATASET: folds of its tasks, or disjoint episodes of its parts.
+
+    Every task is a test task in one of the folds. All folds hold all parts.
+
+    \b
+    Examples:
+      tcmrl-data split data/point-robot --folds 5 --seed 0 --views --out data/folds
+      tcmrl-data split data/point-robot --episodes 45,5 --names fit,holdout --out data/held-out
+    """
+    import tcmrl_data
+
+    numbers = None if episodes is None else episodes.split(",")
+    if numbers is not None and not all(number.isdecimal() for number in numbers):
+        raise click.UsageError(f"--episodes {episodes}: expected numbers such as 45,5.")
+
+    def make(progress: Progress) -> "list[Derived]":
+        return tcmrl_data.split_dataset(
+            dataset,
+            out,
+            folds=folds,
+            seed=seed,
+            episodes=None if numbers is None else [int(number) for number in numbers],
+            names=None if names is None else names.split(","),
+            views=views,
+            dry_run=dry_run,
+            progress=progress,
+        )
+
+    _print(_run(make, out, "split", quiet=quiet), as_json=as_json, dry_run=dry_run)
+
+
+@click.command()
+@SOURCE
+@click.argument("label")
+@output_options
+def rename(dataset: Path, label: str, as_json: bool, quiet: bool) -> None:
+    """Give DATASET the name LABEL. Its folder and its root stay as they are.
+
+    \b
+    Example:
+      tcmrl-data rename data/pr-two-seeds pr/two-seeds
+    """
+    import tcmrl_data
+
+    manifest = tcmrl_data.rename_dataset(dataset, label)
+    if as_json:
+        print_json(
+            {"dataset": str(dataset), "label": label, "digest": manifest.digest, "root": manifest.root}
+        )
+    else:
+        click.echo(f"{printable(str(dataset))}: label {label}, root {manifest.root[:12]} as before")
+
+
+@click.command()
+@SOURCE
+@click.option("--yes", is_flag=True, help="Do not ask.")
+@click.option("--dry-run", is_flag=True, help="Only say what would be removed.")
+@output_options
+def delete(dataset: Path, yes: bool, dry_run: bool, as_json: bool, quiet: bool) -> None:
+    """Delete DATASET, or what a stopped command left of one.
+
+    Files in its folder that are no part of a dataset are listed and kept. A dataset that a process works on
+    is not deleted.
+
+    \b
+    Examples:
+      tcmrl-data delete data/point-robot-medium --dry-run
+      tcmrl-data delete data/point-robot-medium --yes
+    """
+    import tcmrl_data
+
+    found = tcmrl_data.delete_dataset(dataset, dry_run=True)
+    what = f"{found.files:,} files, {size(found.bytes)}"
+    if not dry_run:
+        if not yes:
+            click.confirm(f"Delete {printable(str(dataset))}, {what}?", abort=True, err=True)
+        found = tcmrl_data.delete_dataset(dataset)
+    if as_json:
+        print_json(dataclasses.asdict(found) | {"dataset": str(found.dataset), "dry_run": dry_run})
+        return
+    for file in found.kept:
+        click.echo(f"{printable(file)}: {'would be ' if dry_run else ''}kept, it is no part of a dataset")
+    click.echo(f"{printable(str(found.dataset))}: {what} {'would be ' if dry_run else ''}deleted")
+
+
+def _run(make: Callable[[Progress], Made], out: Path, stage: str, *, quiet: bool) -> Made:
     """Calls a function of the package with progress; Ctrl-C says how to go on."""
     with stopped_by_signals(lambda: same_command(out)), StageProgress(quiet=quiet) as progress:
         return make(lambda done, total: progress.update(stage, done=done, total=total, unit="parts"))

@@ -9,7 +9,7 @@ from tcmrl_data.foundation.sizes import size
 
 from .building import build, plan
 from .cache import cache
-from .curation import derive
+from .curation import delete, derive, merge, rename, split
 from .frame import main_program, make_table, output_options, print_json, print_table, remark
 from .importing import import_data
 from .inspection import inspect
@@ -57,6 +57,10 @@ for _command in (
     import_policy,
     cache,
     derive,
+    merge,
+    split,
+    rename,
+    delete,
 ):
     data.add_command(_command)
 

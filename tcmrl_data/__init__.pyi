@@ -11,6 +11,9 @@ from .build.plan import BuildPlan as BuildPlan
 from .build.plan import plan_build as plan_build
 from .curation.derive import Derived as Derived
 from .curation.derive import derive_dataset as derive_dataset
+from .curation.merge import merge_datasets as merge_datasets
+from .curation.rename import rename_dataset as rename_dataset
+from .curation.split import split_dataset as split_dataset
 from .dataset.dataset import Dataset as Dataset
 from .dataset.dataset import open_dataset as open_dataset
 from .dataset.listing import list_datasets as list_datasets
@@ -72,6 +75,8 @@ from .sampling.sampler import Sampler as Sampler
 from .sampling.sampler import open_sampler as open_sampler
 from .store.limits import MAX_TASKS as MAX_TASKS
 from .store.manifest import Manifest as Manifest
+from .verification.deletion import Deletion as Deletion
+from .verification.deletion import delete_dataset as delete_dataset
 from .verification.garbage import Garbage as Garbage
 from .verification.garbage import collect_garbage as collect_garbage
 from .verification.repair import RepairReport as RepairReport

@@ -1,6 +1,7 @@
 """Small datasets of made-up episodes whose scores are known, made in milliseconds."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,7 @@ def graded_dataset(
     references: References = References(uniform=0.0, oracle=10.0, scripted=None),  # noqa: B008
     recipe: Recipe | None = None,
     episodes: Mapping[int, int] | None = None,
+    moved: bool = False,
 ) -> Dataset:
     """Writes a dataset whose parts have given scores; episode e returns its part's mean + e - 1.5.
 
@@ -48,9 +50,12 @@ def graded_dataset(
         references: of every part.
         recipe: what it was built from.
         episodes: step to number of episodes, where it is not 4.
+        moved: the tasks' goals are others than the recipe draws.
     """
     recipe = recipe or graded_recipe()
     drawn = draw_tasks(recipe.make_environment())
+    if moved:
+        drawn = tuple(replace(task, parameters={"goal": [9.0, 9.0]}) for task in drawn)
     make_folders(folder)
     entries = []
     for task in tasks:

@@ -199,7 +199,7 @@ def test_damage_and_changes_of_the_source_are_found(graded: Dataset, tmp_path: P
     file.write_bytes(data)
     for choice in ({"tier": "expert"}, {"tier": "expert", "episodes": 2}):
         with pytest.raises(StoreError, match=r"00001/0000300.zip"):
-            derive_dataset(copy, tmp_path / f"out {len(choice)}", **choice)  # type: ignore[arg-type]
+            derive_dataset(copy, tmp_path / f"out {len(choice)}", **choice)
     shutil.rmtree(copy)
     opened = graded_dataset(copy)
 

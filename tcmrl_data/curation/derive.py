@@ -6,6 +6,7 @@ from pathlib import Path
 
 from tcmrl_data.curation.assembly import check_out
 from tcmrl_data.curation.plan import Plan, Progress, carry_out, no_progress
+from tcmrl_data.curation.rename import check_label
 from tcmrl_data.curation.subset import Choice, plan_subset
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.tiers import MEDIUM_SCORE, medium_scores
@@ -101,6 +102,7 @@ def derive_dataset(
         >>> derive_dataset("data/point-robot", "data/point-robot-medium", tier="medium")  # doctest: +SKIP
     """
     opened = source if isinstance(source, Dataset) else open_dataset(source)
+    check_label(label)
     if (out is None) == (view is None):
         raise SelectionError("a derivation makes a dataset (--out) or a view (--view); name one of the two")
     if tier is not None and snapshots != "all":

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import GaussianDescription, read_snapshot
 from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Task, draw_tasks
+from tcmrl_data.envs.tasks import Split, Task, draw_tasks
 from tcmrl_data.foundation.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
 from tcmrl_data.foundation.plain_files import words_after
 from tcmrl_data.foundation.validation import first_problem
@@ -71,8 +71,14 @@ def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None
             yield RECORD, f"statistics.{field} is not what the arrays give"
 
 
-def task_problems(tasks: Sequence[Task], recipe: Recipe) -> Iterator[str]:
-    """Yields the differences of a dataset's tasks from those that its recipe draws."""
+def task_problems(tasks: Sequence[Task], recipe: Recipe, splits: Mapping[int, Split]) -> Iterator[str]:
+    """Yields the differences of a dataset's tasks from those that its recipe draws.
+
+    Args:
+        tasks: the dataset's.
+        recipe: the dataset's.
+        splits: of tasks whose split is not the one that the recipe draws, as a derivation says.
+    """
     environment = _environment(recipe)
     if isinstance(environment, str):
         yield environment
@@ -84,8 +90,9 @@ def task_problems(tasks: Sequence[Task], recipe: Recipe) -> Iterator[str]:
     for task in tasks:
         if task.index not in drawn:
             yield f"task {task.index} is not in the recipe's task set"
-        elif task.split != drawn[task.index].split:
-            yield f"split of task {task.index} is not the one that the recipe draws"
+        elif task.split != splits.get(task.index, drawn[task.index].split):
+            source = "derivation says" if task.index in splits else "recipe draws"
+            yield f"split of task {task.index} is not the one that the {source}"
         elif not is_close(task.parameters, dict(drawn[task.index].parameters)):
             yield f"parameters of task {task.index} are not those that the recipe draws"
 

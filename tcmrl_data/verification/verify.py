@@ -185,7 +185,9 @@ class _Verification:
                 self.findings += findings
         progress(len(entries), len(entries))
         if self.level == "deep" and self.manifest is not None and self.manifest.is_drawn:
-            for problem in task_problems(self.tasks, self.manifest.recipe):
+            derivation = self.manifest.derivation
+            splits = derivation.split_of_tasks() if derivation else {}
+            for problem in task_problems(self.tasks, self.manifest.recipe, splits):
                 self._add(TASKS, problem)
         self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *entries, *unnamed})
         return len(entries)
