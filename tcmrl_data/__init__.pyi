@@ -49,6 +49,7 @@ from .interchange.formats.base import FORMATS as FORMATS
 from .interchange.importing import ImportReport as ImportReport
 from .interchange.importing import import_dataset as import_dataset
 from .interchange.readers.base import READERS as READERS
+from .interchange.recording import DatasetRecorder as DatasetRecorder
 from .recipe.document import apply_overrides as apply_overrides
 from .recipe.listing import list_environments as list_environments
 from .recipe.profile import PROFILES as PROFILES
