@@ -1,4 +1,4 @@
-"""`tcmrl-data`: plan, build, list, inspect, verify, repair and export datasets."""
+"""`tcmrl-data`: plan, build, import, list, inspect, verify, repair and export datasets."""
 
 import dataclasses
 from pathlib import Path
@@ -9,7 +9,9 @@ from tcmrl_data.foundation.sizes import size
 
 from .building import build, plan
 from .cache import cache
+from .curation import delete, derive, merge, rename, split
 from .frame import main_program, make_table, output_options, print_json, print_table, remark
+from .importing import import_data
 from .inspection import inspect
 from .plugins import FORMAT
 from .progress import StageProgress
@@ -41,7 +43,25 @@ def data() -> None:
     """
 
 
-for _command in (recipe, plan, build, status, show, inspect, verify, repair, gc, import_policy, cache):
+for _command in (
+    recipe,
+    plan,
+    build,
+    status,
+    show,
+    inspect,
+    verify,
+    repair,
+    gc,
+    import_data,
+    import_policy,
+    cache,
+    derive,
+    merge,
+    split,
+    rename,
+    delete,
+):
     data.add_command(_command)
 
 
@@ -131,7 +151,7 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
     default="all",
     show_default=True,
     metavar="RULE",
-    help="Snapshots to export: all, last, steps>=N, or return>=Q with a quantile Q.",
+    help="Snapshots to export: all, last, steps>=N, return>=Q with a quantile Q, or tier:NAME.",
 )
 @output_options
 def export(
@@ -152,8 +172,8 @@ def export(
 
     exporter = tcmrl_data.FORMATS.get(format_name)()
     opened = tcmrl_data.open_dataset(dataset)
-    folder = opened.folder if opened.folder.name not in ("", "..") else opened.folder.resolve()
-    target = out or folder.with_name(f"{folder.name}-{format_name}")
+    place = opened.path if opened.path.name not in ("", "..") else opened.path.resolve()
+    target = out or place.with_name(f"{place.stem if place.is_file() else place.name}-{format_name}")
     with StageProgress(quiet=quiet) as progress:
         files = exporter.export(
             opened,

@@ -32,12 +32,12 @@ def show(dataset: Path, as_json: bool, quiet: bool) -> None:
     if as_json:
         print_json(document)
         return
-    title = printable(str(opened.folder))
+    title = printable(str(opened.path))
     table = make_table(title, columns=["property", "value"], text=["property"], long_text=["value"])
     for name, value in _rows(document).items():
         table.add_row(name, printable(value))
     print_table(table)
-    for command in _next_commands(opened.folder, document):
+    for command in _next_commands(opened.path, document):
         remark(f"Next: {command}", quiet=quiet)
 
 

@@ -156,11 +156,6 @@ def gc(dataset: Path, as_json: bool, quiet: bool, dry_run: bool) -> None:
 @click.command(name="import-policy")
 @click.argument("zip_file", metavar="ZIP", type=click.Path(path_type=Path))
 @click.option(
-    "--trust-pickle",
-    is_flag=True,
-    help="Trust the author of ZIP: it contains pickles, which can run any code.",
-)
-@click.option(
     "--out", type=click.Path(path_type=Path), required=True, metavar="FOLDER", help="Folder to create."
 )
 @click.option(
@@ -171,21 +166,15 @@ def gc(dataset: Path, as_json: bool, quiet: bool, dry_run: bool) -> None:
     help="Observation that the policy was trained on.",
 )
 @output_options
-def import_policy(
-    zip_file: Path, as_json: bool, quiet: bool, trust_pickle: bool, out: Path, observation: str
-) -> None:
+def import_policy(zip_file: Path, as_json: bool, quiet: bool, out: Path, observation: str) -> None:
     """Convert the SAC actor of a Stable-Baselines3 ZIP to a policy.
 
-    The new folder contains policy.json and policy.safetensors, which hold no pickle.
+    The new folder contains policy.json and policy.safetensors. No pickle of ZIP is run.
 
     \b
     Example:
-      tcmrl-data import-policy sac.zip --trust-pickle --out policies/sac
+      tcmrl-data import-policy sac.zip --out policies/sac
     """
-    if not trust_pickle:
-        raise click.ClickException(
-            f"{zip_file} can run any code when it is read; pass --trust-pickle if you trust its author"
-        )
     import tcmrl_data
 
     snapshot = tcmrl_data.import_sac(zip_file, out, observation="full" if observation == "full" else "stored")

@@ -1,5 +1,5 @@
 from .behavior.base import BEHAVIOR_SOURCES as BEHAVIOR_SOURCES
-from .behavior.snapshot import import_sac as import_sac
+from .behavior.sb3_zip import import_sac as import_sac
 from .build.build import BuildReport as BuildReport
 from .build.build import build_dataset as build_dataset
 from .build.events import BuildEvent as BuildEvent
@@ -9,11 +9,17 @@ from .build.forecast import Forecast as Forecast
 from .build.forecast import forecast_build as forecast_build
 from .build.plan import BuildPlan as BuildPlan
 from .build.plan import plan_build as plan_build
+from .curation.derive import Derived as Derived
+from .curation.derive import derive_dataset as derive_dataset
+from .curation.merge import merge_datasets as merge_datasets
+from .curation.rename import rename_dataset as rename_dataset
+from .curation.split import split_dataset as split_dataset
 from .dataset.dataset import Dataset as Dataset
 from .dataset.dataset import open_dataset as open_dataset
 from .dataset.listing import list_datasets as list_datasets
 from .dataset.returns import return_table as return_table
 from .dataset.selection import Selection as Selection
+from .dataset.tiers import TIERS as TIERS
 from .engine.base import ENGINES as ENGINES
 from .envs.base import ENVIRONMENTS as ENVIRONMENTS
 from .envs.base import Environment as Environment
@@ -32,6 +38,7 @@ from .foundation.canonical import parse_json as parse_json
 from .foundation.errors import CheckpointError as CheckpointError
 from .foundation.errors import SelectionError as SelectionError
 from .foundation.errors import TcmrlError as TcmrlError
+from .foundation.errors import TierError as TierError
 from .foundation.errors import TrainingError as TrainingError
 from .foundation.seeding import NO_TASK as NO_TASK
 from .foundation.seeding import Purpose as Purpose
@@ -39,6 +46,10 @@ from .foundation.seeding import keyed_generator as keyed_generator
 from .foundation.seeding import keyed_seed as keyed_seed
 from .foundation.sizes import parse_bytes as parse_bytes
 from .interchange.formats.base import FORMATS as FORMATS
+from .interchange.importing import ImportReport as ImportReport
+from .interchange.importing import import_dataset as import_dataset
+from .interchange.readers.base import READERS as READERS
+from .interchange.recording import DatasetRecorder as DatasetRecorder
 from .recipe.document import apply_overrides as apply_overrides
 from .recipe.listing import list_environments as list_environments
 from .recipe.profile import PROFILES as PROFILES
@@ -63,7 +74,10 @@ from .sampling.request import Transitions as Transitions
 from .sampling.request import Windows as Windows
 from .sampling.sampler import Sampler as Sampler
 from .sampling.sampler import open_sampler as open_sampler
+from .store.limits import MAX_TASKS as MAX_TASKS
 from .store.manifest import Manifest as Manifest
+from .verification.deletion import Deletion as Deletion
+from .verification.deletion import delete_dataset as delete_dataset
 from .verification.findings import Finding as Finding
 from .verification.findings import VerifyLevel as VerifyLevel
 from .verification.garbage import Garbage as Garbage

@@ -20,7 +20,7 @@ every = pytest.mark.parametrize("name", BEHAVIOR_SOURCES.names())
 @functools.cache
 def recipe_with(name: str) -> Recipe:
     """The quick recipe of the first environment that has a table for a source."""
-    for environment in (family.members()[0] for family in ENVIRONMENTS.working().values()):
+    for environment in (name for family in ENVIRONMENTS.working().values() for name in family.members()[:1]):
         try:
             return load_recipe(environment, profile="quick", behavior=name)
         except RecipeError:

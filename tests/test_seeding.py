@@ -56,4 +56,6 @@ def test_purposes_keep_their_numbers() -> None:
         "EVALUATION_CONTEXT": 11,
         "BEHAVIOR_ACTION": 12,
         "BEHAVIOR_UPDATE": 13,
+        "SUBSET": 14,
+        "FOLDS": 15,
     }

@@ -17,13 +17,11 @@ from types import FrameType
 
 import numpy as np
 import pytest
-from stable_baselines3 import SAC
 from tcmrl_cli.data import data
 from tcmrl_cli.frame import run
 
 import tcmrl_data
 from tcmrl_data import open_dataset, repair_dataset, verify_dataset
-from tcmrl_data.behavior.snapshot import read_snapshot
 from tcmrl_data.build.events import EVENTS
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_file, replace_file
 from tcmrl_data.foundation.errors import (
@@ -31,7 +29,6 @@ from tcmrl_data.foundation.errors import (
     LockedError,
     ManifestError,
     NondeterminismError,
-    SnapshotError,
 )
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PARTS, PartKey, part_file, part_folder
@@ -503,29 +500,6 @@ def test_the_commands_say_what_they_found_and_did(
     for command in (["verify", "--quick", "--deep"], ["verify"], ["repair"], ["gc"]):
         assert run(data, [command[0], str(folder / "parts/main"), *command[1:]]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
-
-
-def test_a_policy_is_imported_only_with_trust(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    environment = tcmrl_data.load_recipe("point-robot").make_environment()
-    task = environment.make({"goal": [0.0, 1.0], "wind": [0.0, 0.0]})
-    model = SAC("MlpPolicy", task, seed=0, device="cpu", policy_kwargs={"net_arch": [8]}, buffer_size=10)
-    model.save(tmp_path / "sac.zip")
-    out = tmp_path / "policies" / "sac"
-    command = ["import-policy", str(tmp_path / "sac.zip"), "--out", str(out)]
-    assert run(data, command) == 2
-    assert "--trust-pickle" in capsys.readouterr().err
-    assert not out.exists()
-    assert run(data, [*command, "--trust-pickle", "--json"]) == 0
-    snapshot = read_snapshot(lambda name, *, limit: (out / name).read_bytes(), 0, place=str(out))
-    assert json.loads(capsys.readouterr().out)["digest"] == snapshot.digest()
-    observations = np.random.default_rng(0).normal(size=(9, 2)).astype(np.float32)
-    acted = snapshot.controller(environment, []).act(observations, np.zeros((9, 2), np.float32))
-    assert np.array_equal(acted, model.predict(observations, deterministic=True)[0])
-    with pytest.raises(SnapshotError, match="exists"):
-        tcmrl_data.import_sac(tmp_path / "sac.zip", out, observation="stored")
-    (tmp_path / "no.zip").write_bytes(os.urandom(100))
-    with pytest.raises(SnapshotError, match=r"no.zip: holds no SAC"):
-        tcmrl_data.import_sac(tmp_path / "no.zip", tmp_path / "other", observation="stored")
 
 
 def test_a_dataset_in_use_cannot_be_repaired(tiny_copy: Copy) -> None:

@@ -33,7 +33,7 @@ class TaskResult:
         returns: returns of the adaptation episodes.
         final: mean return of the adapted policy.
         oracle: return of a controller that knows the task, None if the environment has none.
-        random: return of uniform actions.
+        random: return of uniform actions, None if it was not measured.
         regret: oracle - final, None without an oracle.
         normalized: (final - random) / (best - random), with `best` the return of the reference.
         reference: where `normalized` is 1: the `oracle` or, without one, the best `behavior` policy.
@@ -49,7 +49,7 @@ class TaskResult:
     returns: list[float]
     final: float
     oracle: float | None
-    random: float
+    random: float | None
     regret: float | None
     normalized: float | None
     reference: Literal["oracle", "behavior"]
@@ -246,8 +246,8 @@ def _success(trajectories: Sequence[Trajectory]) -> float | None:
     return fmean(float(trajectory.extras["success"].any()) for trajectory in trajectories)
 
 
-def _share(value: float, low: float, high: float) -> float | None:
-    return None if high == low else (value - low) / (high - low)
+def _share(value: float, low: float | None, high: float) -> float | None:
+    return None if low is None or high == low else (value - low) / (high - low)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

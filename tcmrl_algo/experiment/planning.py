@@ -80,7 +80,7 @@ def plan_runs(
                 environment=environment,
                 method=label,
                 seed=seed,
-                dataset=dataset.folder.resolve(),
+                dataset=dataset.path.resolve(),
                 root=dataset.manifest.root,
                 profile=profile,
                 config=config,

@@ -14,7 +14,8 @@ class RunSettings(BaseModel):
     Attributes:
         algorithm: a file of `tcmrl_algo/algorithms`.
         steps: training steps, and the length of all schedules.
-        snapshots: which snapshots to learn from: `all`, `last`, `steps>=N` or `return>=Q`.
+        snapshots: which snapshots to learn from: `all`, `last`, `steps>=N`,
+            `return>=Q` or `tier:NAME`.
         context_snapshots: which snapshots context and execution trajectories and windows come from, and
             stored contexts in evaluation; those of `snapshots` if left out. The actor-critic's
             transitions are always those of `snapshots`.

@@ -132,7 +132,7 @@ def train_run(
     )
     record = RunRecord(
         environment=dataset.name,
-        dataset=str(dataset.folder.resolve()),
+        dataset=str(dataset.path.resolve()),
         root=dataset.manifest.root,
         profile=profile,
         seed=seed,
@@ -177,7 +177,7 @@ def resume_run(
     """
     run = open_run(out)
     run.check_dataset(dataset)
-    changes = {"steps": steps, "device": device, "dataset": str(dataset.folder.resolve())}
+    changes = {"steps": steps, "device": device, "dataset": str(dataset.path.resolve())}
     record = run.record.model_copy(update={key: value for key, value in changes.items() if value is not None})
     start = run.checkpoints()[-1].step if run.checkpoints() else 0
     if start > record.steps:

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal, Protocol, final
 
 import numpy as np
@@ -14,7 +13,6 @@ from tcmrl_data.envs.base import Environment, Parameters
 from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json, sha256
-from tcmrl_data.foundation.disk import make_folders, write_tree
 from tcmrl_data.foundation.errors import SnapshotError, StoreError
 from tcmrl_data.foundation.plain_files import one_line, printable
 
@@ -186,62 +184,6 @@ def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
         hidden=tuple(tensors[f"hidden.{i}.bias"].size for i in range(len(layers))),
     )
     return Snapshot(step, description, tensors)
-
-
-def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
-    """Imports the actor of a Stable-Baselines3 zip file into a new folder with `policy.json` and its weights.
-
-    The zip file holds pickles, and reading them can run code of the file's author. Only an explicit command
-    calls this function; opening a dataset never does.
-
-    Args:
-        file: a file written by `SAC.save`.
-        out: the new folder.
-        observation: the view that the policy was trained with.
-
-    Raises:
-        SnapshotError: the file holds no SAC with ReLU layers and actions in [-1, 1], or the folder exists.
-        StorageError: the operating system refuses to write a file.
-    """
-    import pickle
-    import zipfile
-
-    from gymnasium.spaces import Box
-    from stable_baselines3 import SAC
-    from torch.nn import ReLU
-
-    if out.exists():
-        raise SnapshotError(f"{out} exists; choose another folder")
-    try:
-        model = SAC.load(file, device="cpu")
-        layers = list(model.policy.actor.latent_pi)
-        if not all(isinstance(layer, ReLU) for layer in layers[1::2]):
-            raise SnapshotError(f"{file}: only policies with ReLU layers can be imported")
-        space = model.action_space
-        assert isinstance(space, Box)  # SAC takes no other
-        if (space.low != -1.0).any() or (space.high != 1.0).any():
-            raise SnapshotError(
-                f"{file}: its actions lie in [{space.low.min():g}, {space.high.max():g}], those of a stored "
-                "policy in [-1, 1]; train it on gymnasium.wrappers.RescaleAction(environment, -1, 1)"
-            )
-        snapshot = snapshot_of_sac(model, step=model.num_timesteps, observation=observation)
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        TypeError,
-        AttributeError,
-        AssertionError,
-        ImportError,
-        RuntimeError,
-        EOFError,
-        pickle.UnpicklingError,
-        zipfile.BadZipFile,
-    ) as error:
-        raise SnapshotError(f"{file}: holds no SAC of Stable-Baselines3 ({one_line(error)})") from None
-    make_folders(out.parent)
-    write_tree(out, snapshot.files())
-    return snapshot
 
 
 @final

@@ -11,7 +11,7 @@ from tcmrl_data.build.driver import Driver
 from tcmrl_data.build.events import BuildEvent, EventLog
 from tcmrl_data.build.ledger import Ledger
 from tcmrl_data.build.plan import plan_build
-from tcmrl_data.build.work_files import WORK_FILES, WORK_FOLDERS, check_work_files
+from tcmrl_data.build.work_files import ASSEMBLY, WORK_FILES, WORK_FOLDERS, check_work_files
 from tcmrl_data.engine.base import ENGINES
 from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
@@ -122,6 +122,8 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
     if not out.is_dir() or (not is_dataset and {entry.name for entry in out.iterdir()} - OWN_FILES):
         raise BuildError(f"--out {out} exists and is no dataset; choose another folder")
     check_work_files(out)
+    if (out / ASSEMBLY).exists() and not is_dataset:
+        raise BuildError(f"{out} holds the beginning of a derived dataset; use another --out")
     if not is_dataset:
         return
     manifest = read_manifest(out)

@@ -14,23 +14,12 @@ from tcmrl_data.envs.controller import Controller, UniformController
 from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
-from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import BuildError, NondeterminismError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
-from tcmrl_data.store.archive import pack_archive
-from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
-from tcmrl_data.store.part_record import (
-    DATA_VERSION,
-    PART_SCHEMA,
-    RECORD,
-    ArrayRecord,
-    Identity,
-    PartRecord,
-    References,
-)
-from tcmrl_data.store.statistics import statistics
+from tcmrl_data.store.part_making import make_part
+from tcmrl_data.store.part_record import PartRecord, References
 
 
 @final
@@ -150,32 +139,17 @@ def seal_part(
         references: of the task.
         behavior: what the behavior source records with its parts.
     """
-    arrays = pack(trajectories)
-    records = {
-        name: ArrayRecord.model_validate_json(canonical_json(record))
-        for name, record in array_digests(arrays).items()
-    }
-    identity = Identity(
-        data_version=DATA_VERSION,
+    return make_part(
         settings=plan.recipe.unit_settings(),
-        task=task.index,
-        parameters=dict(task.parameters),
+        task=task,
         step=snapshot.step,
         seed=plan.seed,
-        policy=snapshot.digest(),
-        arrays=records,
-    )
-    record = PartRecord(
-        schema_version=PART_SCHEMA,
-        id=digest(identity.model_dump(mode="json")),
-        identity=identity,
-        statistics=statistics(trajectories),
+        snapshot=snapshot,
+        trajectories=trajectories,
         references=references,
-        behavior=dict(behavior),
+        behavior=behavior,
         platform=plan.platform,
     )
-    record_bytes = canonical_json(record.model_dump(mode="json"))
-    return record, pack_archive(encode_arrays(arrays) | snapshot.files() | {RECORD: record_bytes})
 
 
 def roll_out_part(plan: BuildPlan, *, task: Task, snapshot: Snapshot, lanes: Lanes) -> list[Trajectory]:

@@ -17,7 +17,10 @@ from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import TASKS
 
 WORK_FOLDERS = {STAGING, CHECKPOINTS}
-WORK_FILES = {LOCK, EVENTS, EARLIER_EVENTS}
+ASSEMBLY = ".assembly.json"
+"""What is being put together in a folder that is no dataset yet, see `curation/assembly.py`."""
+
+WORK_FILES = {LOCK, EVENTS, EARLIER_EVENTS, ASSEMBLY}
 """A verification looks at their kind only, never into them."""
 
 TABLES = {TASKS, PARTS_TABLE}

@@ -1,7 +1,9 @@
 """Reading: `open_dataset` → `Dataset`; tables and parts are read when they are first used."""
 
 import functools
+import os
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,10 +12,18 @@ from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import Snapshot, read_snapshot
 from tcmrl_data.dataset.selection import Selection, chosen_parts
+from tcmrl_data.dataset.view import View, is_view_file, read_view
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.envs.trajectory import Trajectory
-from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TaskError, TrajectoryError
+from tcmrl_data.foundation.errors import (
+    ManifestError,
+    SelectionError,
+    SnapshotError,
+    StoreError,
+    TaskError,
+    TrajectoryError,
+)
 from tcmrl_data.foundation.plain_files import folder_problem
 from tcmrl_data.foundation.validation import first_problem
 from tcmrl_data.store.archive import Archive
@@ -37,37 +47,66 @@ class TaskReferences(References):
 
 
 def open_dataset(path: str | Path) -> "Dataset":
-    """Opens a dataset, given its folder or its `manifest.json`.
+    """Opens a dataset, given its folder or its `manifest.json`, or a view file that names parts of one.
 
-    Only the manifest is read. The tables of tasks and parts are read when they are first used, and are
-    checked against the manifest; so is a part's archive. `verify_dataset` checks everything.
+    Only the manifest is read, and of a view the view and the source's table of tasks. The other tables are
+    read when they are first used, and are checked against the manifest; so is a part's archive.
+    `verify_dataset` checks everything.
 
     Raises:
-        ManifestError: the manifest is missing, truncated, edited or of another version.
+        ManifestError: the manifest or the view is missing, truncated, edited or of another version, or the
+            view's source is not the dataset that the view was made of.
 
     Example:
         >>> dataset = open_dataset("data/point-robot")  # doctest: +SKIP
         >>> dataset.select(split="train", snapshots="last").trajectories(0)  # doctest: +SKIP
     """
+    if is_view_file(path):
+        return _open_view(Path(path))
     folder = dataset_folder(path)
     return Dataset(folder, read_manifest(folder))
 
 
+def _open_view(file: Path) -> "Dataset":
+    view = read_view(file)
+    folder = Path(os.path.normpath(file.resolve().parent / view.source))
+    try:
+        source = Dataset(folder, read_manifest(folder))
+    except ManifestError as error:
+        raise ManifestError(f"{file} is a view of {folder}: {error}") from None
+    if source.manifest.root != view.source_root:
+        raise ManifestError(
+            f"{file} is a view of a dataset with root {view.source_root[:12]}, {folder} has "
+            f"{source.manifest.root[:12]}; put that dataset there, or derive the view again"
+        )
+    manifest = view.manifest_of(source.manifest, [task.index for task in source.recorded_tasks])
+    return Dataset(folder, manifest, file=file, view=view)
+
+
 class Dataset:
-    """A dataset on disk; made by `open_dataset`.
+    """A dataset on disk, or some of its parts by a view; made by `open_dataset`.
 
     Attributes:
-        folder: where it lies.
-        manifest: its manifest.
+        folder: where the parts lie.
+        manifest: its manifest; of a view, that of a dataset of the view's parts.
+        path: what `open_dataset` opens: the folder, or the view's file.
     """
 
-    def __init__(self, folder: Path, manifest: Manifest) -> None:
-        self.folder, self.manifest = folder, manifest
+    def __init__(
+        self, folder: Path, manifest: Manifest, file: Path | None = None, view: View | None = None
+    ) -> None:
+        self.folder, self.manifest, self.path = folder, manifest, folder if file is None else file
+        self._view = view
         self._record = functools.lru_cache(KEPT_RECORDS)(self._read_record)
 
-    def __reduce__(self) -> tuple[type["Dataset"], tuple[Path, Manifest]]:
-        """Another process gets the manifest, and reads tables and parts by itself."""
-        return Dataset, (self.folder, self.manifest)
+    def __reduce__(self) -> tuple[type["Dataset"], tuple[Path, Manifest, Path, View | None]]:
+        """Another process gets manifest and view, and reads tables and parts by itself."""
+        return Dataset, (self.folder, self.manifest, self.path, self._view)
+
+    @property
+    def sealed_root(self) -> str:
+        """Root of the dataset in the folder, of which a view may leave out parts."""
+        return self.manifest.root if self._view is None else self._view.source_root
 
     @property
     def name(self) -> str:
@@ -98,7 +137,12 @@ class Dataset:
     def tasks(self) -> tuple[Task, ...]:
         """The dataset's tasks, ascending by index; errors as of `recorded_tasks`."""
         dropped = set(self.manifest.dropped)
-        return tuple(task for task in self.recorded_tasks if task.index not in dropped)
+        splits = self._view.derivation.split_of_tasks() if self._view else {}
+        return tuple(
+            replace(task, split=splits.get(task.index, task.split))
+            for task in self.recorded_tasks
+            if task.index not in dropped
+        )
 
     @functools.cached_property
     def parts(self) -> PartTable:
@@ -109,6 +153,8 @@ class Dataset:
         """
         file = self.folder / PARTS_TABLE
         table = self.recorded_parts.without_tasks(self.manifest.dropped)
+        if self._view is not None:
+            table = table.only(self._view.keys)
         if table.root != self.manifest.root:
             raise ManifestError(f"{file}: its parts do not have the manifest's root; run `tcmrl-data verify`")
         if not set(table.runs) <= {run.name for run in self.manifest.runs}:
@@ -250,26 +296,41 @@ class Dataset:
             raise StoreError(f"{file}: {error}; run `tcmrl-data repair`") from None
 
     def snapshot(self, task: int, step: int, run: str = MAIN_RUN) -> Snapshot:
-        """The behavior policy of a part."""
-        self.part(task, step, run)
+        """The behavior policy of a part.
+
+        Raises:
+            SnapshotError: the part has none, or it cannot be read.
+        """
+        if self.part(task, step, run).identity.policy is None:
+            place = self.file_of(PartKey(task, step, run))
+            raise SnapshotError(f"{place}: holds no policy, since its source does not say which one acted")
         with self.open_part(PartKey(task, step, run)) as archive:
             return read_snapshot(archive.read, step, place=str(archive.path))
 
     def select(
-        self, *, split: Split | None = None, tasks: Sequence[int] | None = None, snapshots: str = "all"
+        self,
+        *,
+        split: Split | None = None,
+        tasks: Sequence[int] | None = None,
+        snapshots: str = "all",
+        tier: str | None = None,
     ) -> Selection:
         """A view of some tasks and snapshots.
 
         Args:
             split: only tasks of this split.
             tasks: only these indices; one that is named twice counts once.
-            snapshots: `all`, `last`, `steps>=N`, or `return>=Q`: of each task, the parts whose mean
-                return reaches the quantile Q in [0, 1] of the task's parts.
+            snapshots: `all`, `last`, `steps>=N`, `return>=Q`: of each task, the parts whose mean
+                return reaches the quantile Q in [0, 1] of the task's parts; or `tier:NAME`.
+            tier: a quality tier, such as `medium`; the same as the rule `tier:medium`. `tiers.py` names them.
 
         Raises:
             SelectionError: the rule cannot be read, or nothing is left of a task.
             TaskError: an index that the dataset does not hold.
         """
+        if tier is not None and snapshots != "all":
+            raise SelectionError(f"snapshots {snapshots!r} and tier {tier!r} exclude each other; name one")
+        rule = snapshots if tier is None else f"tier:{tier}"
         chosen = list(self.tasks)
         if tasks is not None:
             chosen = [self.task(index) for index in dict.fromkeys(tasks)]
@@ -279,7 +340,7 @@ class Dataset:
                 f"{self.folder}: no {split or 'such'} tasks in the dataset; build some with --tasks"
             )
         return Selection(
-            self, tuple(chosen), {task.index: chosen_parts(self, task.index, snapshots) for task in chosen}
+            self, tuple(chosen), {task.index: chosen_parts(self, task.index, rule) for task in chosen}
         )
 
     def _read_record(self, key: PartKey) -> PartRecord:

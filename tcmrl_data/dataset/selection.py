@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tcmrl_data.dataset.tiers import tier_parts
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import SelectionError
@@ -13,6 +14,8 @@ from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.dataset import Dataset
+
+_RULE = re.compile(r"all|last|steps>=(\d+)|return>=(0(?:\.\d+)?|1(?:\.0+)?)|tier:(.*)")
 
 
 def chosen_parts(dataset: "Dataset", task: int, rule: str) -> tuple[PartKey, ...]:
@@ -27,10 +30,10 @@ def chosen_parts(dataset: "Dataset", task: int, rule: str) -> tuple[PartKey, ...
             f"{dataset.folder}: task {task} lacks snapshots {missing}; finish it with `tcmrl-data build`"
         )
     keys = dataset.parts.keys_of(task)
-    match = re.fullmatch(r"all|last|steps>=(\d+)|return>=(0(?:\.\d+)?|1(?:\.0+)?)", rule.replace(" ", ""))
+    match = _RULE.fullmatch(rule.replace(" ", ""))
     if match is None:
         raise SelectionError(
-            f"snapshots {rule!r}: expected all, last, steps>=N or return>=Q with Q in [0, 1]"
+            f"snapshots {rule!r}: expected all, last, steps>=N, return>=Q with Q in [0, 1], or tier:NAME"
         )
     chosen = keys
     if rule == "last":
@@ -42,6 +45,8 @@ def chosen_parts(dataset: "Dataset", task: int, rule: str) -> tuple[PartKey, ...
         means = {key: dataset.entry(key).mean for key in keys}
         threshold = np.quantile(list(means.values()), float(match[2]))
         chosen = [key for key in keys if means[key] >= threshold]
+    elif match[3] is not None:
+        chosen = tier_parts(dataset, task, match[3])
     if not chosen:
         raise SelectionError(
             f"{dataset.folder}: snapshots {rule!r} leaves nothing of task {task}, "

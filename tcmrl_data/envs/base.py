@@ -120,6 +120,11 @@ class Environment(abc.ABC):
         return [cls.name]
 
     @classmethod
+    def provides(cls, name: str) -> bool:
+        """Whether the name of a dataset's environment is one of this class."""
+        return name in cls.members()
+
+    @classmethod
     def recipe_file(cls, name: str) -> Traversable:
         """The TOML recipe of the environment `name`; plug-ins of other packages override this method."""
         return importlib.resources.files("tcmrl_manifests") / f"{name.partition('/')[0]}.toml"
@@ -212,7 +217,7 @@ class EnvironmentRegistry(Registry[Environment]):
 
     def get(self, name: str) -> type[Environment]:
         family = super().get(name.partition("/")[0])
-        if name not in family.members():
+        if not family.provides(name):
             raise unknown_name(self.noun, name, family.members())
         return family
 

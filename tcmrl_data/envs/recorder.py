@@ -21,7 +21,7 @@ KINDS: Mapping[str, type[np.generic]] = {
 
 @final
 class Recorder:
-    """Collects the transitions of one episode per lane.
+    """Collects the transitions of one episode per lane in memory; `DatasetRecorder` writes a dataset.
 
     Example:
         >>> import numpy as np

@@ -7,7 +7,8 @@ import shutil
 import stat
 import tempfile
 import uuid
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import IO, Any, TextIO
 
@@ -17,6 +18,9 @@ from tcmrl_data.foundation.locks import is_locked, try_exclusive_lock
 STAGING = ".staging"
 LOCK = ".lock"
 CHECKPOINTS = ".checkpoints"
+
+SYNCS = 16
+"""Files that are forced to disk side by side; a disk makes several durable in the time of one."""
 
 GO_ON = "make room on the disk or repair it, then run the same command again to continue"
 
@@ -132,6 +136,46 @@ def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> Non
         finally:
             temporary.unlink(missing_ok=True)
         disk.sync(path.parent)
+
+
+def place_file(path: Path, data: bytes, *, staging: Path) -> None:
+    """Writes a file for a folder that nobody reads yet; `sync_files` makes it durable, with many others.
+
+    Other processes see the whole file or none. A crash of the machine may leave anything of it, so whoever
+    goes on after a crash must check its content.
+
+    Args:
+        path: the file; missing parent folders are created.
+        data: the content.
+        staging: folder for the unfinished file.
+
+    Raises:
+        StorageError: the operating system refuses an operation.
+    """
+    temporary = staging / f"{path.name}.{uuid.uuid4().hex}"
+    with named_errors(path):
+        missing = [folder for folder in (path.parent, *path.parents, staging) if not folder.exists()]
+        for folder in sorted(missing):
+            with contextlib.suppress(FileExistsError):  # another thread may have created it meanwhile
+                disk.make_folder(folder)
+        try:
+            disk.write(temporary, data)
+            disk.rename(temporary, path)
+        finally:
+            temporary.unlink(missing_ok=True)
+
+
+def sync_files(root: Path, files: Iterable[Path]) -> None:
+    """Forces files below a folder to disk: their contents first, then their names and those of their folders.
+
+    Raises:
+        StorageError: the operating system refuses an operation.
+    """
+    files = list(files)
+    folders = {folder for file in files for folder in file.parents if folder.is_relative_to(root)}
+    with named_errors(root), ThreadPoolExecutor(SYNCS) as pool:
+        list(pool.map(disk.sync, files))
+        list(pool.map(disk.sync, sorted(folders)))
 
 
 def remove_tree(folder: Path) -> None:

@@ -17,6 +17,10 @@ class RecipeError(TcmrlError):
     """A recipe, profile or `--set` override that is not valid."""
 
 
+class SimulationError(TcmrlError):
+    """An environment that cannot be simulated."""
+
+
 class TaskError(TcmrlError):
     """A task index that does not exist, or a task list that cannot be read."""
 
@@ -43,6 +47,10 @@ class SnapshotError(TcmrlError):
 
 class SelectionError(TcmrlError):
     """A selection of tasks, snapshots or trajectories that is empty or not allowed."""
+
+
+class TierError(SelectionError):
+    """A quality tier whose snapshots are not as good or bad as its name says."""
 
 
 class RequestError(TcmrlError):

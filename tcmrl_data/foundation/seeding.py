@@ -26,6 +26,8 @@ class Purpose(enum.IntEnum):
     EVALUATION_CONTEXT = 11
     BEHAVIOR_ACTION = 12
     BEHAVIOR_UPDATE = 13
+    SUBSET = 14
+    FOLDS = 15
 
 
 def environment_key(environment: str) -> int:

@@ -48,6 +48,17 @@ class Rollouts(_Table):
         return self
 
 
+class NoRollouts(Rollouts):
+    """The rollouts of a run whose episodes come from elsewhere: none."""
+
+    episodes: Literal[0] = 0
+    lanes: Literal[0] = 0
+
+    @model_validator(mode="after")
+    def _full_lane_batches(self) -> "NoRollouts":
+        return self
+
+
 class TaskChoice(_Table):
     """The `[build]` table: which tasks, and what a unit takes; no part of any digest.
 
@@ -120,7 +131,7 @@ class Recipe(_Table):
     about: About
     environment: EnvironmentTable
     behavior: BehaviorTable
-    rollouts: Rollouts
+    rollouts: NoRollouts | Rollouts
     build: TaskChoice
     training: dict[Profile, dict[str, Any]]
 

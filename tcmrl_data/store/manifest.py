@@ -6,11 +6,13 @@ Tasks and parts stand in tables beside it (`tables.py`). The manifest seals them
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import FailFast, Field, model_validator
+from pydantic import FailFast, Field, field_validator, model_validator
 
+from tcmrl_data.envs.tasks import Split
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, canonical_json, digest, parse_json
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
+from tcmrl_data.foundation.ranges import read_ranges
 from tcmrl_data.foundation.records import Record, parse_record
 from tcmrl_data.recipe.profile import Profile
 from tcmrl_data.recipe.recipe import Recipe
@@ -28,6 +30,9 @@ _Index = Annotated[int, Field(ge=0, lt=MAX_INDEX)]
 
 RunKind = Literal["built", "extended", "relabelled", "imported", "recorded", "subset"]
 
+FOREIGN_KINDS: tuple[RunKind, ...] = ("imported", "recorded")
+"""Runs whose episodes were not made here: nothing of them can be made again."""
+
 
 class Run(Record):
     """Parts of a dataset that were made in one way.
@@ -35,7 +40,8 @@ class Run(Record):
     Attributes:
         kind: how its parts came to be.
         seed: root seed; null where none is known.
-        recipe: what it was built from; null where nothing was built.
+        recipe: what it was built from; null where nothing was built and another run has the recipe. That of
+            imported and recorded episodes says of which environment they are, and no rollouts.
         origin: where its parts come from, if they were not built.
         steps: snapshot steps that every task is to have; null where no more is expected than there is.
     """
@@ -69,12 +75,30 @@ class Derivation(Record):
         settings: of the operation.
         sources: the datasets that it read.
         package: version of tcmrl that did it.
+        splits: tasks of each split, such as `0-9,12`, where they are not as the recipe draws them.
     """
 
     operation: str = Field(pattern=r"^[a-z0-9_-]{1,64}$")
     settings: dict[str, Any]
     sources: tuple[Source, ...]
     package: str
+    splits: dict[Split, str] | None = None
+
+    @field_validator("splits")
+    @classmethod
+    def _splits_are_ranges(cls, splits: dict[Split, str] | None) -> dict[Split, str] | None:
+        members = [read_ranges(text, limit=MAX_TASKS) for text in (splits or {}).values()]
+        if len({task for tasks in members for task in tasks}) < sum(map(len, members)):
+            raise ValueError("a task is in two splits")
+        return splits
+
+    def split_of_tasks(self) -> dict[int, Split]:
+        """The splits of `splits`, by task."""
+        return {
+            task: split
+            for split, text in (self.splits or {}).items()
+            for task in read_ranges(text, limit=MAX_TASKS)
+        }
 
 
 class TableSeal(Record):
@@ -156,6 +180,11 @@ class Manifest(Record):
     def training(self) -> dict[Profile, dict[str, Any]]:
         """Training defaults per profile."""
         return self.recipe.training
+
+    @property
+    def is_drawn(self) -> bool:
+        """Whether the recipe drew the tasks; those of a foreign dataset are as its source has them."""
+        return self.runs[0].kind not in FOREIGN_KINDS
 
     @property
     def num_tasks(self) -> int:

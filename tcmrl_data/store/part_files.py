@@ -29,21 +29,22 @@ def check_members(archive: Archive, record: PartRecord) -> list[ArrayLayout]:
     layouts = check_layout(
         archive, {name: array.model_dump() for name, array in record.identity.arrays.items()}
     )
-    odd = _odd_member(archive, layouts)
+    odd = _odd_member(archive, layouts, has_policy=record.identity.policy is not None)
     if odd:
         raise StoreError(f"{archive.place(odd)} does not agree with the arrays; run `tcmrl-data repair`")
     check_expansion(layouts, archive.size, archive.path)
     return layouts
 
 
-def _odd_member(archive: Archive, layouts: Sequence[ArrayLayout]) -> str | None:
-    """A file that the part's arrays call for and its archive lacks, or the other way round."""
+def _odd_member(archive: Archive, layouts: Sequence[ArrayLayout], *, has_policy: bool) -> str | None:
+    """A file that the part's record calls for and its archive lacks, or the other way round."""
     found = set(archive.names)
     for layout in layouts:
         if prod(layout.grid) > len(found):
             return f"{ARRAYS}/{layout.name}/c"
-    needed = {f"{ARRAYS}/zarr.json", POLICY[0], RECORD}.union(*(layout.files() for layout in layouts))
-    return min((needed ^ found) - {POLICY[1]}, default=None)
+    needed = {f"{ARRAYS}/zarr.json", RECORD}.union(*(layout.files() for layout in layouts))
+    needed |= {POLICY[0]} if has_policy else set()
+    return min((needed ^ found) - ({POLICY[1]} if has_policy else set()), default=None)
 
 
 def identity_problems(

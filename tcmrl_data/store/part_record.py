@@ -32,7 +32,7 @@ STANDARD_ARRAYS = {
 }
 """dtype and rank of the arrays of every part; an environment's extra arrays have rank 1."""
 
-_ARRAY_NAME = r"[a-z0-9_]{1,64}"
+ARRAY_NAME = r"[a-z0-9_]{1,64}"
 
 
 class ArrayRecord(Record):
@@ -54,7 +54,8 @@ class Identity(Record):
         parameters: its parameters.
         step: snapshot step.
         seed: root seed of the build; episode seeds are keyed by (environment, task, purpose, step, episode).
-        policy: digest of the snapshot.
+            Null where it is not known.
+        policy: digest of the snapshot; null where the part holds none.
         arrays: decoded contents.
         derived: how the part was made from other parts; null for rollouts of its own policy.
     """
@@ -64,8 +65,8 @@ class Identity(Record):
     task: int = Field(ge=0, lt=MAX_INDEX)
     parameters: dict[str, Any]
     step: int = Field(ge=0, lt=MAX_INDEX)
-    seed: int = Field(ge=0)
-    policy: str = Field(pattern=SHA256)
+    seed: int | None = Field(ge=0)
+    policy: str | None = Field(pattern=SHA256)
     arrays: dict[str, ArrayRecord] = Field(max_length=MAX_ARRAYS)
     derived: dict[str, Any] | None = None
 
@@ -80,7 +81,7 @@ class Identity(Record):
         steps, episodes = arrays["actions"].shape[0], arrays["episode_offsets"].shape[0] - 1
         rows = {"observations": steps + episodes, "episode_offsets": episodes + 1}
         for name, record in arrays.items():
-            if not re.fullmatch(_ARRAY_NAME, name):
+            if not re.fullmatch(ARRAY_NAME, name):
                 raise ValueError(f"{name[:80]!r} is no array name")
             if name not in STANDARD_ARRAYS and len(record.shape) != 1:
                 raise ValueError(f"{name} must be of rank 1")
@@ -113,12 +114,12 @@ class References(Record):
     """Mean returns to compare results with, over the recipe's number of episodes.
 
     Attributes:
-        uniform: uniform actions.
+        uniform: uniform actions; null where it was not measured.
         oracle: a controller that knows the task; null where none can be computed.
         scripted: the environment's noise-free expert; null where there is none.
     """
 
-    uniform: float
+    uniform: float | None
     oracle: float | None
     scripted: float | None
 

@@ -57,7 +57,7 @@ class PartEntry(NamedTuple):
     min: float
     max: float
     success_rate: float | None
-    uniform: float
+    uniform: float | None
     oracle: float | None
     scripted: float | None
 
@@ -161,7 +161,7 @@ class PartTable:
         values["run"] = [self.runs[run] for run in values["run"]]
         for name in ("id", "sha256"):
             values[name] = [digest.hex() for digest in values[name]]
-        for name in ("success_rate", "oracle", "scripted"):
+        for name in ("success_rate", *REFERENCES):
             values[name] = [None if math.isnan(value) else value for value in values[name]]
         return map(PartEntry._make, zip(*(values[name] for name in PartEntry._fields), strict=True))
 
@@ -180,6 +180,14 @@ class PartTable:
             return self
         kept = ~np.isin(self.columns["task"], list(tasks))
         return PartTable(self.runs, {name: column[kept] for name, column in self.columns.items()})
+
+    def only(self, keys: Collection[PartKey]) -> "PartTable":
+        """The table of some of its parts; keys that it does not have count for nothing."""
+        kept = np.fromiter((key in keys for key in self), dtype=np.bool_, count=len(self))
+        used = np.unique(self.columns["run"][kept])
+        columns = {name: column[kept] for name, column in self.columns.items()}
+        columns["run"] = np.searchsorted(used, columns["run"]).astype(np.int32)
+        return PartTable([self.runs[run] for run in used], columns)
 
     @functools.cached_property
     def root(self) -> str:

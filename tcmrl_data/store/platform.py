@@ -71,6 +71,18 @@ class Platform(Record):
         ]
 
 
+UNKNOWN = Platform(
+    cpu="unknown",
+    system="unknown",
+    python="unknown",
+    instructions={},
+    variables={},
+    packages={},
+    physics={},
+)
+"""The platform of a part whose source does not name one; it equals no real platform."""
+
+
 def this_platform(environment: Environment, behavior: str | None = None) -> Platform:
     """The platform of this process.
 

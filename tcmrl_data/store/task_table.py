@@ -7,9 +7,9 @@ from typing import Annotated, Any, Literal
 from pydantic import FailFast, Field, TypeAdapter, ValidationError
 
 from tcmrl_data.envs.tasks import Task
-from tcmrl_data.foundation.canonical import canonical_json
-from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.canonical import canonical_json, parse_json
+from tcmrl_data.foundation.errors import ManifestError, TaskError
+from tcmrl_data.foundation.plain_files import one_line, printable
 from tcmrl_data.foundation.records import Record, hidden_text
 from tcmrl_data.foundation.validation import first_problem
 from tcmrl_data.store.limits import MAX_INDEX
@@ -62,6 +62,26 @@ def _is_canonical(tasks: Iterable[Task], data: bytes) -> bool:
         return b"".join(map(task_line, tasks)) == data
     except ValueError:  # NaN or infinity in a task's parameters
         return False
+
+
+def parse_task_file(data: bytes, file: Path) -> list[Task]:
+    """The tasks of a JSON list that a user wrote: `[{"index": 0, "split": "train", "parameters": {}}]`.
+
+    Raises:
+        TaskError: it is no such list, or a task stands there twice.
+    """
+    try:
+        records = _RECORDS.validate_python(parse_json(data), strict=True)
+    except ValidationError as error:
+        raise TaskError(f"{file}: {printable(first_problem(error))[:500]}") from None
+    except ValueError as error:
+        raise TaskError(f"{file}: not JSON ({one_line(error)})") from None
+    tasks = [Task(record.index, record.split, record.parameters) for record in records]
+    if len({task.index for task in tasks}) < len(tasks):
+        raise TaskError(f"{file}: a task stands there twice")
+    if hidden := hidden_text([task.parameters for task in tasks]):
+        raise TaskError(f"{file}: {printable(hidden)[:200]} holds control characters")
+    return tasks
 
 
 def _parse_block(block: bytes, file: Path) -> Iterable[TaskRecord]:

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import GaussianDescription, read_snapshot
 from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Task, draw_tasks
+from tcmrl_data.envs.tasks import Split, Task, draw_tasks
 from tcmrl_data.foundation.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
 from tcmrl_data.foundation.plain_files import words_after
 from tcmrl_data.foundation.validation import first_problem
@@ -54,7 +54,9 @@ def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None
     problems = list(_value_problems(arrays))
     yield from problems
     if recipe is not None and environment is not None:
-        yield from _shape_problems(arrays, recipe, environment)
+        yield from _shape_problems(
+            arrays, recipe, environment, is_derived=record.identity.derived is not None
+        )
     try:
         episodes = unpack(arrays)
     except (StoreError, TrajectoryError) as error:
@@ -69,8 +71,14 @@ def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None
             yield RECORD, f"statistics.{field} is not what the arrays give"
 
 
-def task_problems(tasks: Sequence[Task], recipe: Recipe) -> Iterator[str]:
-    """Yields the differences of a dataset's tasks from those that its recipe draws."""
+def task_problems(tasks: Sequence[Task], recipe: Recipe, splits: Mapping[int, Split]) -> Iterator[str]:
+    """Yields the differences of a dataset's tasks from those that its recipe draws.
+
+    Args:
+        tasks: the dataset's.
+        recipe: the dataset's.
+        splits: of tasks whose split is not the one that the recipe draws, as a derivation says.
+    """
     environment = recipe_environment(recipe)
     if isinstance(environment, str):
         yield environment
@@ -79,8 +87,9 @@ def task_problems(tasks: Sequence[Task], recipe: Recipe) -> Iterator[str]:
     for task in tasks:
         if task.index not in drawn:
             yield f"task {task.index} is not in the recipe's task set"
-        elif task.split != drawn[task.index].split:
-            yield f"split of task {task.index} is not the one that the recipe draws"
+        elif task.split != splits.get(task.index, drawn[task.index].split):
+            source = "derivation says" if task.index in splits else "recipe draws"
+            yield f"split of task {task.index} is not the one that the {source}"
         elif not is_close(task.parameters, dict(drawn[task.index].parameters)):
             yield f"parameters of task {task.index} are not those that the recipe draws"
 
@@ -112,6 +121,8 @@ def recipe_environment(recipe: Recipe) -> Environment | str:
 def _policy_problems(
     archive: Archive, record: PartRecord, environment: Environment | str | None
 ) -> Iterator[ContentProblem]:
+    if record.identity.policy is None:
+        return
     try:
         snapshot = read_snapshot(archive.read, record.identity.step, place=str(archive.path))
     except SnapshotError as error:
@@ -138,10 +149,16 @@ def _value_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[ContentP
 
 
 def _shape_problems(
-    arrays: Mapping[str, npt.NDArray[Any]], recipe: Recipe, environment: Environment | str
+    arrays: Mapping[str, npt.NDArray[Any]],
+    recipe: Recipe,
+    environment: Environment | str,
+    *,
+    is_derived: bool,
 ) -> Iterator[ContentProblem]:
+    """Differences from what the recipe calls for; derived parts may lack episodes and extra arrays."""
     episodes = len(arrays["episode_offsets"]) - 1
-    if episodes != recipe.rollouts.episodes:
+    is_whole = recipe.rollouts.episodes > 0 and not is_derived
+    if is_whole and episodes != recipe.rollouts.episodes:
         yield "episode_offsets", f"{episodes} episodes, not the recipe's {recipe.rollouts.episodes}"
     if isinstance(environment, str):
         yield RECORD, environment
@@ -151,7 +168,7 @@ def _shape_problems(
             yield name, f"have {arrays[name].shape[1]} columns, {environment.name} has {width}"
     extras = {name: str(array.dtype) for name, array in arrays.items() if name not in STANDARD_ARRAYS}
     wanted = {name: str(np.dtype(dtype)) for name, dtype in environment.extras.items()}
-    if extras != wanted:
+    if extras != wanted and (is_whole or not extras.items() <= wanted.items()):
         yield RECORD, f"extra arrays {extras} are not the environment's {wanted}"
     longest = int(np.diff(arrays["episode_offsets"]).max(initial=0))
     if longest > environment.settings.horizon:

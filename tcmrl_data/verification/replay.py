@@ -69,6 +69,8 @@ def replay_part(archive: Archive, record: PartRecord, key: PartKey, recipe: Reci
     identity = record.identity
     differences: tuple[str, ...] = ()
     try:
+        if identity.seed is None or identity.policy is None:
+            raise ValueError("its seed or its policy is not known")
         _check_cost(archive, record, recipe)
         task = Task(identity.task, "train", identity.parameters)  # the split has no part in rollouts
         plan = BuildPlan.of_tasks(recipe, seed=identity.seed, tasks=[task])

@@ -3,6 +3,7 @@
 import contextlib
 from collections.abc import Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 from tcmrl_data.build.published import Published, read_published
@@ -134,9 +135,16 @@ def _read_parts(folder: Path) -> list[Published]:
 def _draw_again(table: PartTable, manifest: Manifest) -> tuple[Task, ...]:
     """The tasks of the parts and of the recipe's choice, as the recipe draws them.
 
+    Their splits are those of the derivation, if it has changed any.
+
     Raises:
+        BuildError: the tasks are not the recipe's.
         ManifestError: the recipe's environment cannot be made, or has more tasks than a dataset may have.
     """
+    if not manifest.is_drawn:
+        raise BuildError(
+            f"{TASKS} is damaged, and nobody can draw the tasks of foreign data; import or record them again"
+        )
     recipe = manifest.recipe
     environment = recipe_environment(recipe)
     if isinstance(environment, str):
@@ -144,4 +152,9 @@ def _draw_again(table: PartTable, manifest: Manifest) -> tuple[Task, ...]:
     present = set(table.columns["task"].tolist())
     if len(present) < manifest.tasks.lines:
         present |= {task.index for task in choose_tasks(recipe)}
-    return tuple(task for task in draw_tasks(environment) if task.index in present)
+    splits = manifest.derivation.split_of_tasks() if manifest.derivation else {}
+    return tuple(
+        replace(task, split=splits.get(task.index, task.split))
+        for task in draw_tasks(environment)
+        if task.index in present
+    )

@@ -11,13 +11,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from tcmrl_data.dataset.dataset import open_dataset
+from tcmrl_data.dataset.view import is_view_file
 from tcmrl_data.foundation.disk import LOCK, lock_holder
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, words_after
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PARTS, key_of_file, part_file
-from tcmrl_data.store.manifest import MANIFEST, Manifest, dataset_folder, read_manifest
+from tcmrl_data.store.manifest import FOREIGN_KINDS, MANIFEST, Manifest, dataset_folder, read_manifest
 from tcmrl_data.store.part_record import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry
 from tcmrl_data.store.task_table import TASKS
@@ -73,6 +75,9 @@ def verify_dataset(
         ()
     """
     started = time.monotonic()
+    if is_view_file(path):
+        source = open_dataset(path).folder
+        raise ManifestError(f"{path} is a sound view of {source}; verify that dataset, which holds the parts")
     folder = dataset_folder(path)
     if not folder.is_dir() or not any((folder / name).exists() for name in (MANIFEST, PARTS)):
         raise ManifestError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
@@ -136,8 +141,9 @@ class _Verification:
                 progress(done, len(entries))
                 self.findings += [finding(file, problem) for problem in problems]
         progress(len(entries), len(entries))
-        if self._level == "deep" and manifest is not None:
-            for problem in task_problems(self._description.tasks, manifest.recipe):
+        if self._level == "deep" and manifest is not None and manifest.is_drawn:
+            splits = manifest.derivation.split_of_tasks() if manifest.derivation else {}
+            for problem in task_problems(self._description.tasks, manifest.recipe, splits):
                 self._add(TASKS, problem)
         self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *entries, *unnamed})
         return len(entries)
@@ -146,7 +152,11 @@ class _Verification:
         """Makes parts again and compares; parts with findings are left out."""
         runs = self._description.manifest.runs if self._description.manifest else ()
         bad = {found.file for found in self.findings}
-        recipes = {run.name: run.recipe for run in runs if run.recipe is not None}
+        recipes = {
+            run.name: run.recipe
+            for run in runs
+            if run.recipe is not None and run.kind not in (*FOREIGN_KINDS, "subset")
+        }
         keys = [key for key in self._description.table if part_file(key) not in bad and key.run in recipes]
         replays = []
         for key in spread_parts(keys, number):

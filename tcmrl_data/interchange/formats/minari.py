@@ -85,7 +85,7 @@ class MinariFormat(Format):
 
 def dataset_id(dataset: Dataset, task: int, snapshots: str = "all") -> str:
     """The name of a task's Minari dataset; a rule's `>=` and `.` become `-ge-` and `_`."""
-    rule = snapshots.replace(" ", "").replace(">=", "-ge-").replace(".", "_")
+    rule = snapshots.replace(" ", "").replace(">=", "-ge-").replace(".", "_").replace(":", "-")
     return f"tcmrl/{dataset.name}/task{task:05d}-{rule}-v0"
 
 
@@ -203,9 +203,11 @@ def _buffer(dataset: Dataset, key: PartKey, episode: int, trajectory: Trajectory
             f"{dataset.file_of(key)}: episode {episode} has no steps, which Minari cannot "
             "hold; export with --format hdf5"
         )
-    part = dataset.part(*key)
+    seed = dataset.part(*key).identity.seed
     return EpisodeBuffer(
-        seed=keyed_seed(part.identity.seed, dataset.name, key.task, Purpose.ROLLOUT_RESET, key.step, episode),
+        seed=None
+        if seed is None
+        else keyed_seed(seed, dataset.name, key.task, Purpose.ROLLOUT_RESET, key.step, episode),
         observations=trajectory.observations,
         actions=trajectory.actions,
         rewards=trajectory.rewards,

@@ -1,0 +1,276 @@
+"""A new dataset that is put together from parts, resumably."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from tcmrl_data.build.published import Published, read_published
+from tcmrl_data.build.work_files import ASSEMBLY, check_work_files
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.envs.tasks import Split, Task
+from tcmrl_data.foundation.canonical import canonical_json, sha256
+from tcmrl_data.foundation.disk import (
+    LOCK,
+    STAGING,
+    lock_file,
+    make_folders,
+    place_file,
+    remove_abandoned,
+    replace_file,
+    sync_files,
+)
+from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.foundation.ranges import write_ranges
+from tcmrl_data.store.archive import LARGEST_ARCHIVE
+from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.store.limits import MAX_PARTS
+from tcmrl_data.store.manifest import Derivation, Manifest, Run, Source
+from tcmrl_data.store.part_record import PartRecord
+from tcmrl_data.store.part_table import PartEntry, PartTable
+from tcmrl_data.store.platform import Platform
+from tcmrl_data.store.sealing import write_dataset
+
+WRITERS = 4
+"""Parts that are copied side by side."""
+
+
+@dataclass(frozen=True)
+class Copied:
+    """A part of a new dataset that is a part of another one, byte for byte.
+
+    Attributes:
+        key: in the new dataset.
+        source: the other dataset.
+        source_key: in that dataset.
+    """
+
+    key: PartKey
+    source: Dataset
+    source_key: PartKey
+
+    @property
+    def entry(self) -> PartEntry:
+        """The part's line in its source."""
+        return self.source.entry(self.source_key)
+
+    @property
+    def platform(self) -> Platform:
+        """The platform that it was made on."""
+        return self.source.manifest.platforms[self.entry.platform]
+
+
+def derivation_of(
+    operation: str,
+    settings: Mapping[str, Any],
+    sources: Sequence[Dataset],
+    *,
+    splits: Mapping[int, Split] | None = None,
+) -> Derivation:
+    """What the manifest of a derived dataset says of how it was made.
+
+    Args:
+        operation: such as `subset` or `merge`.
+        settings: JSON values that the result follows from, together with the sources.
+        sources: the datasets that it is made from.
+        splits: of tasks whose split is not as the recipe draws it; None takes them over from the sources.
+    """
+    if splits is None:
+        derivations = [source.manifest.derivation for source in sources]
+        splits = dict(item for found in derivations if found for item in found.split_of_tasks().items())
+    names: tuple[Split, ...] = ("train", "test")
+    members = {name: [task for task, split in splits.items() if split == name] for name in names}
+    return Derivation(
+        operation=operation,
+        settings=dict(settings),
+        sources=tuple(Source(label=source.manifest.label, root=source.manifest.root) for source in sources),
+        package=version("tcmrl"),
+        splits={name: write_ranges(tasks) for name, tasks in members.items()} if splits else None,
+    )
+
+
+class Assembly:
+    """A new dataset that is put together from parts; it exists when its manifest does.
+
+    Parts are written one by one; copies are forced to disk together before the manifest is written. The same
+    command, given again after a crash, finds sound parts and goes on. The folder is locked while the assembly
+    is open.
+
+    Args:
+        out: the new dataset's folder: free, empty, or one where the same assembly was stopped.
+        derivation: what is made; an assembly of another derivation is not continued.
+        sources: datasets that are read; they must not change meanwhile.
+
+    Raises:
+        StoreError: the folder holds something else.
+        LockedError: another process writes to the folder.
+
+    Example:
+        >>> with open_assembly(out, derivation, [source]) as assembly:  # doctest: +SKIP
+        ...     assembly.copy([Copied(key, source, key) for key in source.parts])
+        ...     assembly.finish(tasks=source.tasks, runs=source.manifest.runs)
+    """
+
+    def __init__(self, out: Path, derivation: Derivation, sources: Sequence[Dataset]) -> None:
+        self._out, self._derivation, self._sources = out, derivation, tuple(sources)
+        self._entries: list[PartEntry] = []
+        self._platforms: list[Platform] = []
+        self._copied: list[Path] = []
+
+    def holds(self, key: PartKey) -> bool:
+        """Whether a part was published before, by an attempt that was stopped."""
+        return (self._out / part_file(key)).is_file()
+
+    def copy(
+        self,
+        parts: Sequence[Copied],
+        *,
+        progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> None:
+        """Copies parts; each is hashed on the way.
+
+        Args:
+            parts: the parts.
+            progress: called with parts done and parts in all.
+
+        Raises:
+            StoreError: a part of a source is missing or damaged; the message names it.
+            StorageError: the operating system refuses an operation.
+        """
+        make_folders(self._out / STAGING)
+        with ThreadPoolExecutor(WRITERS) as pool:
+            for done, entry in enumerate(pool.map(self._copy, parts), start=1):
+                self._add(entry, parts[done - 1].platform)
+                progress(done, len(parts))
+        self._copied += [self._out / part_file(part.key) for part in parts]
+
+    def write(self, key: PartKey, make: Callable[[], tuple[PartRecord, bytes]]) -> PartEntry:
+        """Publishes a new part, unless an attempt that was stopped has done so.
+
+        Args:
+            key: the part's.
+            make: makes the part's record and archive.
+        """
+        file = self._out / part_file(key)
+        published: Published | None = None
+        if self.holds(key):
+            with contextlib.suppress(StoreError, ManifestError):  # a damaged part is made again
+                published, _ = read_published(file, key.run)
+        if published is None:
+            record, data = make()
+            replace_file(file, data, staging=self._out / STAGING)
+            published = Published.of_record(record, run=key.run, archive=data)
+        return self._add(published.entry, published.platform)
+
+    def finish(
+        self,
+        *,
+        name: str,
+        data_version: int,
+        runs: Sequence[Run],
+        tasks: Sequence[Task],
+        label: str | None = None,
+    ) -> Manifest:
+        """Writes tables and manifest; the dataset exists from then on.
+
+        Args:
+            name: the environment's name.
+            data_version: of the parts.
+            runs: of the parts.
+            tasks: the dataset's tasks.
+            label: the dataset's own name.
+
+        Raises:
+            StoreError: a source has changed since it was opened, or no part is left.
+        """
+        for source in self._sources:
+            if open_dataset(source.path).manifest.digest != source.manifest.digest:
+                raise StoreError(f"{source.path} has changed meanwhile; run the same command again")
+        if not 0 < len(self._entries) <= MAX_PARTS:
+            raise StoreError(
+                f"{self._out} would have {len(self._entries)} parts; 1 to {MAX_PARTS} are possible"
+            )
+        sync_files(self._out, self._copied)
+        manifest = write_dataset(
+            self._out,
+            name=name,
+            label=label,
+            data_version=data_version,
+            runs=runs,
+            derivation=self._derivation,
+            platforms=self._platforms,
+            tasks=tasks,
+            table=PartTable.empty().with_entries(self._entries),
+        )
+        (self._out / ASSEMBLY).unlink()
+        return manifest
+
+    def _copy(self, part: Copied) -> PartEntry:
+        """Copies a part unless it is there; returns its line."""
+        target, entry = self._out / part_file(part.key), part.entry
+        if not _holds(target, entry):
+            with part.source.open_part(part.source_key) as archive:
+                data = archive.content()
+            if sha256(data) != entry.sha256:
+                file = part.source.file_of(part.source_key)
+                raise StoreError(f"{file} does not have the recorded sha256; run `tcmrl-data repair`")
+            place_file(target, data, staging=self._out / STAGING)
+        return entry._replace(run=part.key.run)
+
+    def _add(self, entry: PartEntry, platform: Platform) -> PartEntry:
+        if platform not in self._platforms:
+            self._platforms.append(platform)
+        entry = entry._replace(platform=self._platforms.index(platform))
+        self._entries.append(entry)
+        return entry
+
+
+def _holds(file: Path, entry: PartEntry) -> bool:
+    """Whether a part is in its place; after a crash its file may hold anything."""
+    if not file.is_file():
+        return False
+    try:
+        return sha256(read_plain_file(file, limit=entry.size)) == entry.sha256
+    except (OSError, ValueError):
+        return False
+
+
+@contextlib.contextmanager
+def open_assembly(out: Path, derivation: Derivation, sources: Sequence[Dataset]) -> Iterator[Assembly]:
+    """Begins an assembly, or goes on with one that was stopped; arguments and errors as of `Assembly`."""
+    check_out(out, derivation)
+    make_folders(out)
+    with lock_file(out / LOCK, f"dataset {out}"):
+        check_out(out, derivation)
+        remove_abandoned(out)
+        replace_file(out / ASSEMBLY, _note(derivation), staging=out / STAGING)
+        yield Assembly(out, derivation, sources)
+
+
+def check_out(out: Path, derivation: Derivation) -> None:
+    """Refuses a folder that is neither new nor one where the same assembly was stopped.
+
+    Raises:
+        StoreError: it is not; the message names it.
+        BuildError: its work files are links.
+    """
+    if not out.exists():
+        return
+    if not out.is_dir():
+        raise StoreError(f"--out {out} is a file; choose another folder")
+    check_work_files(out)
+    begun = out / ASSEMBLY
+    if not begun.exists() and {entry.name for entry in out.iterdir()} - {LOCK, STAGING}:
+        raise StoreError(f"--out {out} exists and is not empty; choose another folder or remove it")
+    if begun.exists() and read_plain_file(begun, limit=LARGEST_ARCHIVE) != _note(derivation):
+        raise StoreError(
+            f"--out {out} holds the beginning of another dataset; choose another folder or remove it"
+        )
+
+
+def _note(derivation: Derivation) -> bytes:
+    return canonical_json(derivation.model_dump(mode="json"))

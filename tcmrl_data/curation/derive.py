@@ -1,0 +1,170 @@
+"""`derive_dataset`: a selection of a dataset becomes a dataset or a view."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tcmrl_data.curation.assembly import check_out
+from tcmrl_data.curation.plan import Plan, Progress, carry_out, no_progress
+from tcmrl_data.curation.rename import check_label
+from tcmrl_data.curation.subset import Choice, plan_subset
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.dataset.tiers import MEDIUM_SCORE, medium_scores
+from tcmrl_data.dataset.view import write_view
+from tcmrl_data.envs.tasks import Split
+from tcmrl_data.foundation.errors import SelectionError, TierError
+from tcmrl_data.store.manifest import read_manifest
+
+TOLERANCE = 15.0
+"""A medium snapshot whose score is further from 33 than this is hardly medium: 18 to 48 are near."""
+
+
+@dataclass(frozen=True)
+class Derived:
+    """What a derivation made, or would make.
+
+    Attributes:
+        out: the dataset's folder or the view's file.
+        parts: number of parts.
+        cut: number of parts among them that were made anew.
+        bytes: size of the archives; before parts are cut, that of the whole parts.
+        tasks: number of tasks.
+        steps: snapshot steps that occur.
+        label: the dataset's own name.
+        root: None where it is not known, as before parts are cut.
+        sources: roots of the datasets that were read.
+        far_from_medium: scores of medium snapshots that are not near 33, by the text of their keys.
+    """
+
+    out: Path
+    parts: int
+    cut: int
+    bytes: int
+    tasks: int
+    steps: tuple[int, ...]
+    label: str | None
+    root: str | None
+    sources: tuple[str, ...]
+    far_from_medium: dict[str, float]
+
+
+def derive_dataset(
+    source: str | Path | Dataset,
+    out: str | Path | None = None,
+    *,
+    view: str | Path | None = None,
+    tier: str | None = None,
+    snapshots: str = "all",
+    tasks: Sequence[int] | None = None,
+    split: Split | None = None,
+    episodes: int | str | None = None,
+    seed: int | None = None,
+    min_return: float | None = None,
+    drop_arrays: Sequence[str] = (),
+    label: str | None = None,
+    tolerance: float = TOLERANCE,
+    strict: bool = False,
+    dry_run: bool = False,
+    progress: Progress = no_progress,
+) -> Derived:
+    """Makes a dataset, or a view, of some parts and episodes of another.
+
+    Whole parts keep their ids and their bytes. Parts that lose episodes or arrays are made anew and name the
+    part that they were cut from. The same call, made again after an interruption, goes on.
+
+    Args:
+        source: a dataset or a view of one.
+        out: folder of the new dataset.
+        view: file of the new view instead, which names parts and copies nothing.
+        tier: a quality tier, such as `medium`; `dataset/tiers.py` defines them.
+        snapshots: a rule of `Dataset.select`, instead of a tier.
+        tasks: indices.
+        split: only tasks of this split.
+        episodes: of each part, a number or a share such as `50%`.
+        seed: draws the episodes; None takes the first.
+        min_return: only episodes whose undiscounted return reaches it; parts without one are left out.
+        drop_arrays: extra arrays, such as `success`, that are left out.
+        label: the new dataset's own name.
+        tolerance: distance from a score of 33 up to which a medium snapshot is near it.
+        strict: refuse a tier whose medium snapshots are not near 33.
+        dry_run: only say what would be made.
+        progress: called with parts done and parts in all.
+
+    Raises:
+        SelectionError: the choice cannot be read, contradicts itself, or leaves nothing of a task.
+        TierError: with `strict`, a medium snapshot is not near 33.
+        TaskError: an index that the dataset does not hold.
+        StoreError: `out` or `view` exists, or a part is damaged, or the source has changed meanwhile.
+        StorageError: the operating system refuses an operation.
+        LockedError: another process writes to `out`.
+
+    Example:
+        >>> derive_dataset("data/point-robot", "data/point-robot-medium", tier="medium")  # doctest: +SKIP
+    """
+    opened = source if isinstance(source, Dataset) else open_dataset(source)
+    check_label(label)
+    if (out is None) == (view is None):
+        raise SelectionError("a derivation makes a dataset (--out) or a view (--view); name one of the two")
+    if tier is not None and snapshots != "all":
+        raise SelectionError(f"snapshots {snapshots!r} and tier {tier!r} exclude each other; name one")
+    rule = snapshots if tier is None else f"tier:{tier}"
+    indices = None if tasks is None else tuple(tasks)
+    choice = Choice(rule, indices, split, episodes, seed, min_return, tuple(drop_arrays))
+    plan = plan_subset(opened, choice, label=label)
+    far = _far_from_medium(plan, rule, tolerance)
+    if strict and far:
+        raise TierError(f"{opened.path}: not near a score of {MEDIUM_SCORE:g}: {describe_far(far)}")
+    target = Path(out if out is not None else view or "")
+    root = None
+    if view is not None:
+        _write_view(plan, target, dry_run=dry_run)
+    elif dry_run:
+        check_out(target, plan.derivation)
+    else:
+        carry_out(plan, target, progress)
+    if not dry_run:
+        root = (read_manifest(target) if view is None else open_dataset(target).manifest).root
+    return summary(plan, target, root=root, far=far)
+
+
+def summary(plan: Plan, out: Path, *, root: str | None, far: dict[str, float] | None = None) -> Derived:
+    """What is said of a planned or made dataset."""
+    return Derived(
+        out=out,
+        parts=len(plan.parts),
+        cut=plan.num_cut,
+        bytes=plan.bytes,
+        tasks=len(plan.tasks),
+        steps=tuple(sorted({part.key.step for part in plan.parts})),
+        label=plan.label,
+        root=root,
+        sources=tuple(source.root for source in plan.derivation.sources),
+        far_from_medium=far or {},
+    )
+
+
+def describe_far(far: dict[str, float]) -> str:
+    """The first medium snapshots that are not near 33, in words."""
+    named = [f"{key} has {score:.0f}" for key, score in list(far.items())[:3]]
+    more = f", and {len(far) - 3} more" if len(far) > 3 else ""
+    return "; ".join(named) + more
+
+
+def _write_view(plan: Plan, file: Path, *, dry_run: bool) -> None:
+    if plan.num_cut:
+        raise SelectionError(
+            "--view: a view names whole parts; use --out for parts that lose episodes or arrays"
+        )
+    if not dry_run:
+        (source,) = plan.sources
+        write_view(
+            file, source, [part.key for part in plan.parts], derivation=plan.derivation, label=plan.label
+        )
+
+
+def _far_from_medium(plan: Plan, rule: str, tolerance: float) -> dict[str, float]:
+    if "medium" not in rule:
+        return {}
+    (source,) = plan.sources
+    scores = medium_scores(source, [task.index for task in plan.tasks])
+    return {str(key): score for key, score in scores.items() if abs(score - MEDIUM_SCORE) > tolerance}

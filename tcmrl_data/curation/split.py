@@ -1,0 +1,170 @@
+"""`split_dataset`: folds over the tasks of a dataset, or disjoint episodes of all its parts."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from tcmrl_data.curation.assembly import check_out, derivation_of
+from tcmrl_data.curation.cutting import Cut
+from tcmrl_data.curation.derive import Derived, summary
+from tcmrl_data.curation.plan import Plan, PlannedPart, Progress, carry_out, no_progress, settle_runs
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.dataset.view import write_view
+from tcmrl_data.envs.tasks import Split
+from tcmrl_data.foundation.errors import ManifestError, SelectionError
+from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
+from tcmrl_data.store.manifest import read_manifest
+
+FOLD, EPISODES = "fold", "episodes"
+
+
+def split_dataset(
+    source: str | Path | Dataset,
+    out: str | Path,
+    *,
+    folds: int | None = None,
+    seed: int = 0,
+    episodes: Sequence[int] | None = None,
+    names: Sequence[str] | None = None,
+    views: bool = False,
+    dry_run: bool = False,
+    progress: Progress = no_progress,
+) -> list[Derived]:
+    """Makes several datasets of one: task folds, or disjoint episodes of every part.
+
+    Every task is a test task in one of the folds; all folds hold all parts, which keep ids and bytes. Of
+    `episodes=(45, 5)` the first dataset has the first 45 episodes of every part and the second the next 5.
+
+    Args:
+        source: a dataset or a view of one.
+        out: folder in which the datasets are made.
+        folds: number of folds.
+        seed: draws the folds.
+        episodes: numbers of episodes, one per dataset, instead of folds.
+        names: of the datasets, for their folders; 0, 1, … without names.
+        views: make a view file per fold, `out/0.json`, instead of copying all parts.
+        dry_run: only say what would be made.
+        progress: called with parts done and parts in all, over all datasets.
+
+    Raises:
+        SelectionError: numbers that are not possible, or not both or none of folds and episodes.
+        StoreError: a dataset of that name exists, a part is damaged, or the source has changed meanwhile.
+        StorageError: the operating system refuses an operation.
+
+    Example:
+        >>> split_dataset("data/point-robot", "data/folds", folds=5, views=True)  # doctest: +SKIP
+    """
+    opened = source if isinstance(source, Dataset) else open_dataset(source)
+    if (folds is None) == (episodes is None):
+        raise SelectionError(
+            "a split is into folds (--folds) or by episodes (--episodes); name one of the two"
+        )
+    if views and folds is None:
+        raise SelectionError("--views: a view names whole parts; episodes can only be split into datasets")
+    if folds is not None:
+        plans = [plan_fold(opened, folds=folds, seed=seed, fold=fold) for fold in range(folds)]
+    else:
+        plans = list(_plan_episodes(opened, tuple(episodes or ())))
+    chosen = [str(number) for number in range(len(plans))] if names is None else list(names)
+    if len(set(chosen)) != len(plans) or not all(map(_is_name, chosen)):
+        raise SelectionError(f"--names {','.join(chosen)}: expected {len(plans)} different names of folders")
+    targets = [Path(out) / (f"{name}.json" if views else name) for name in chosen]
+    waiting = [pair for pair in zip(plans, targets, strict=True) if not _is_made(*pair)]
+    for plan, target in waiting if not views else ():
+        check_out(target, plan.derivation)
+    total = sum(len(plan.parts) for plan, _ in waiting)
+    before = 0
+    for plan, target in waiting if not dry_run else ():
+        if views:
+            keys = [part.key for part in plan.parts]
+            write_view(target, opened, keys, derivation=plan.derivation, label=None)
+        else:
+            carry_out(plan, target, _shifted(progress, before, total))
+        before += len(plan.parts)
+    roots = [None if dry_run else open_dataset(target).manifest.root for target in targets]
+    made = zip(plans, targets, roots, strict=True)
+    return [summary(plan, target, root=root) for plan, target, root in made]
+
+
+def plan_fold(source: Dataset, *, folds: int, seed: int, fold: int) -> Plan:
+    """The dataset in which one fold of the tasks is the test split, and all others the training split.
+
+    Raises:
+        SelectionError: fewer than two folds, or so many that a split would lack tasks.
+    """
+    tasks = source.tasks
+    if not 2 <= folds <= len(tasks) or len(tasks) - -(-len(tasks) // folds) < 2:
+        raise SelectionError(
+            f"{source.path}: {len(tasks)} tasks do not make {folds} folds; every fold needs a test task and "
+            "two training tasks"
+        )
+    order = keyed_generator(seed, source.name, NO_TASK, Purpose.FOLDS).permutation(len(tasks))
+    tested = {tasks[position].index for position in order[fold::folds]}
+    splits: dict[int, Split] = {task.index: "test" if task.index in tested else "train" for task in tasks}
+    settings = {"folds": folds, "seed": seed, "fold": fold}
+    keys = tuple(source.parts)
+    changed = tuple(replace(task, split=splits[task.index]) for task in tasks)
+    return Plan(
+        name=source.name,
+        data_version=source.manifest.data_version,
+        runs=settle_runs(source.manifest.runs, keys, tasks),
+        tasks=changed,
+        parts=tuple(PlannedPart(key, source, key) for key in keys),
+        derivation=derivation_of(FOLD, settings, [source], splits=splits),
+        sources=(source,),
+    )
+
+
+def plan_episodes(source: Dataset, *, first: int, number: int) -> Plan:
+    """The dataset of some consecutive episodes of every part.
+
+    Args:
+        source: a dataset.
+        first: position of the first episode.
+        number: of episodes.
+
+    Raises:
+        SelectionError: a part has fewer episodes.
+    """
+    parts = []
+    for entry in source.parts.entries():
+        if first + number > entry.episodes:
+            raise SelectionError(
+                f"{source.path}: {entry.key} has {entry.episodes} episodes, not {first + number}"
+            )
+        cut = None if number == entry.episodes else Cut(tuple(range(first, first + number)))
+        parts.append(PlannedPart(entry.key, source, entry.key, cut))
+    keys, cut_runs = [part.key for part in parts], {part.key.run for part in parts if part.cut}
+    return Plan(
+        name=source.name,
+        data_version=source.manifest.data_version,
+        runs=settle_runs(source.manifest.runs, keys, source.tasks, cut=cut_runs),
+        tasks=source.tasks,
+        parts=tuple(parts),
+        derivation=derivation_of(EPISODES, {"first": first, "number": number}, [source]),
+        sources=(source,),
+    )
+
+
+def _plan_episodes(source: Dataset, numbers: tuple[int, ...]) -> Iterator[Plan]:
+    if len(numbers) < 2 or min(numbers) < 1:
+        raise SelectionError(f"--episodes {numbers}: expected two numbers or more, each at least 1, as 45,5")
+    for place, number in enumerate(numbers):
+        yield plan_episodes(source, first=sum(numbers[:place]), number=number)
+
+
+def _shifted(progress: Progress, before: int, total: int) -> Progress:
+    return lambda done, _: progress(before + done, total)
+
+
+def _is_name(name: str) -> bool:
+    return name not in ("", ".", "..") and Path(name).name == name
+
+
+def _is_made(plan: Plan, target: Path) -> bool:
+    """Whether a dataset was made by the same command, which was stopped later."""
+    try:
+        found = read_manifest(target) if target.is_dir() else open_dataset(target).manifest
+    except ManifestError:
+        return False
+    return found.derivation == plan.derivation

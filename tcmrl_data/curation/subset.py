@@ -1,0 +1,195 @@
+"""Which parts and episodes of a dataset a subset takes."""
+
+import math
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from tcmrl_data.curation.assembly import derivation_of
+from tcmrl_data.curation.cutting import SUBSET, Cut
+from tcmrl_data.curation.plan import Plan, PlannedPart, settle_runs
+from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.tiers import MEDIUM_SCORE, task_scores
+from tcmrl_data.envs.tasks import Split
+from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.foundation.seeding import Purpose, keyed_generator
+from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.part_record import STANDARD_ARRAYS
+
+MAX_RECORDED_TASKS = 5_000
+"""Scores of more tasks are not recorded, so that the manifest stays small; `task_scores` gives them."""
+
+_SHARE = re.compile(r"(\d{1,3}(?:\.\d+)?)%")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a subset takes of a dataset; nothing is left out by default.
+
+    Attributes:
+        snapshots: a rule of `Dataset.select`.
+        tasks: indices.
+        split: only tasks of this split.
+        episodes: of each part, a number or a share such as `50%`.
+        seed: draws the episodes; None takes the first.
+        min_return: only episodes whose undiscounted return reaches it.
+        drop_arrays: extra arrays that are left out.
+    """
+
+    snapshots: str = "all"
+    tasks: tuple[int, ...] | None = None
+    split: Split | None = None
+    episodes: int | str | None = None
+    seed: int | None = None
+    min_return: float | None = None
+    drop_arrays: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        _share(self.episodes)
+        if self.seed is not None and (self.episodes is None or self.seed < 0):
+            raise SelectionError(f"seed {self.seed}: a seed of at least 0 draws episodes; say how many")
+        if self.min_return is not None and not math.isfinite(self.min_return):
+            raise SelectionError(f"min_return {self.min_return} is no return")
+
+    def to_json(self) -> dict[str, Any]:
+        """The choice as a derivation records it."""
+        tasks = None if self.tasks is None else sorted(set(self.tasks))
+        return vars(self) | {"tasks": tasks, "drop_arrays": sorted(set(self.drop_arrays))}
+
+    @classmethod
+    def from_json(cls, settings: dict[str, Any]) -> "Choice":
+        """The inverse of `to_json`; further settings are left aside.
+
+        Raises:
+            KeyError, TypeError, SelectionError: settings of another form.
+        """
+        values = {name: settings[name] for name in cls.__dataclass_fields__}
+        tasks = values["tasks"]
+        lists = {
+            "tasks": None if tasks is None else tuple(tasks),
+            "drop_arrays": tuple(values["drop_arrays"]),
+        }
+        return cls(**values | lists)
+
+
+def plan_subset(source: Dataset, choice: Choice, *, label: str | None = None) -> Plan:
+    """The dataset of a choice.
+
+    Raises:
+        SelectionError: nothing is left of a task, a part has fewer episodes than are asked for, or an array
+            cannot be left out.
+        TaskError: an index that the dataset does not hold.
+        StoreError: a part whose returns are needed is damaged.
+    """
+    selection = source.select(split=choice.split, tasks=choice.tasks, snapshots=choice.snapshots)
+    tasks = tuple(sorted(selection.tasks, key=lambda task: task.index))
+    parts: list[PlannedPart] = []
+    for task in tasks:
+        kept = [
+            PlannedPart(key, source, key, None if cut == Cut() else cut)
+            for key in selection.parts[task.index]
+            if (cut := _cut(source, key, choice)) is not None
+        ]
+        if not kept:
+            raise SelectionError(
+                f"{source.path}: no episode of task {task.index} has a return of {choice.min_return:g}; "
+                "leave the task out with --tasks"
+            )
+        parts += kept
+    _check_arrays(source, parts, choice.drop_arrays)
+    cut_runs = {part.key.run for part in parts if part.cut}
+    settings = choice.to_json() | _scores(source, choice.snapshots, [task.index for task in tasks])
+    return Plan(
+        name=source.name,
+        data_version=source.manifest.data_version,
+        runs=settle_runs(source.manifest.runs, [part.key for part in parts], tasks, cut=cut_runs),
+        tasks=tasks,
+        parts=tuple(parts),
+        derivation=derivation_of(SUBSET, settings, [source]),
+        sources=(source,),
+        label=label,
+    )
+
+
+def _cut(source: Dataset, key: PartKey, choice: Choice) -> Cut | None:
+    """What a choice keeps of a part; None if nothing."""
+    entry = source.entry(key)
+    positions: Sequence[int] = range(entry.episodes)
+    if choice.min_return is not None and entry.min < choice.min_return:
+        positions = []
+        if entry.max >= choice.min_return:
+            positions = [
+                position
+                for position, episode in enumerate(source.trajectories(*key))
+                if episode.undiscounted_return >= choice.min_return
+            ]
+        if not positions:
+            return None
+    number = _number(choice.episodes, entry.episodes, f"{source.path}: {key}")
+    if number is not None and number < len(positions):
+        positions = (
+            positions[:number] if choice.seed is None else _draw(source, key, positions, number, choice.seed)
+        )
+    all_kept = len(positions) == entry.episodes
+    return Cut(None if all_kept else tuple(positions), tuple(sorted(set(choice.drop_arrays))))
+
+
+def _draw(source: Dataset, key: PartKey, positions: Sequence[int], number: int, seed: int) -> list[int]:
+    generator = keyed_generator(seed, source.name, key.task, Purpose.SUBSET, key.step)
+    return sorted(np.array(positions)[generator.permutation(len(positions))[:number]].tolist())
+
+
+def _share(episodes: int | str | None) -> float | None:
+    """The share that `episodes` names; None where it names a number or nothing.
+
+    Raises:
+        SelectionError: neither a number of at least 1 nor a share in (0, 100] percent.
+    """
+    match = _SHARE.fullmatch(episodes) if isinstance(episodes, str) else None
+    if match and 0 < float(match[1]) <= 100:
+        return float(match[1]) / 100
+    if episodes is None or (isinstance(episodes, int) and episodes >= 1):
+        return None
+    raise SelectionError(f"episodes {episodes!r}: expected a number of at least 1, or a share such as 50%")
+
+
+def _number(episodes: int | str | None, present: int, place: str) -> int | None:
+    """How many episodes of a part to keep."""
+    share = _share(episodes)
+    if share is not None:
+        return max(1, round(share * present))
+    if isinstance(episodes, int) and episodes > present:
+        raise SelectionError(f"{place} has {present} episodes, not the {episodes} that are asked for")
+    return episodes if isinstance(episodes, int) else None
+
+
+def _check_arrays(source: Dataset, parts: Sequence[PlannedPart], names: Sequence[str]) -> None:
+    """Refuses arrays that are not there, by the first part of every run."""
+    firsts = {part.source_key.run: part.source_key for part in reversed(parts)} if names else {}
+    for key in firsts.values():
+        extras = set(source.part(*key).identity.arrays) - set(STANDARD_ARRAYS)
+        for name in sorted(set(names) - extras):
+            known = ", ".join(sorted(extras)) or "none"
+            raise SelectionError(
+                f"{source.file_of(key)}: array {name!r} cannot be left out; its extra arrays are: {known}"
+            )
+
+
+def _scores(source: Dataset, rule: str, tasks: Sequence[int]) -> dict[str, Any]:
+    """What a derivation records of a tier: its threshold, and the steps and scores that it chose from."""
+    tier = rule.replace(" ", "").partition("tier:")[2]
+    if tier in ("", "mixed", "random"):
+        return {}
+    found: dict[str, Any] = {"medium_score": MEDIUM_SCORE}
+    if len(tasks) <= MAX_RECORDED_TASKS:
+        found["scores"] = {str(task): list(_ladders(source, task)) for task in tasks}
+    return found
+
+
+def _ladders(source: Dataset, task: int) -> Iterator[list[Any]]:
+    """Run, step and score of every part of a task."""
+    for key, score in task_scores(source, task).items():
+        yield [key.run, key.step, round(score, 4)]

@@ -1,0 +1,191 @@
+"""Views: small files that name parts of a dataset, which open as a dataset does.
+
+A view holds the path of its source relative to itself, the source's root, and the keys of its parts. It opens
+only on a source with that root.
+"""
+
+import functools
+import os
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import Field, model_validator
+
+from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, canonical_json, digest, parse_json
+from tcmrl_data.foundation.disk import replace_file
+from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.foundation.plain_files import one_line, read_plain_file
+from tcmrl_data.foundation.ranges import count_ranges, read_ranges, write_ranges
+from tcmrl_data.foundation.records import Record, parse_record
+from tcmrl_data.store.keys import RUN_NAME, PartKey
+from tcmrl_data.store.limits import MAX_STEPS, MAX_TASKS
+from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, Totals
+from tcmrl_data.store.part_record import SHA256
+from tcmrl_data.store.sealing import totals_of
+
+if TYPE_CHECKING:
+    from tcmrl_data.dataset.dataset import Dataset
+
+VIEW_SCHEMA = 1
+
+
+class ViewedParts(Record):
+    """Tasks of which a view takes the same snapshots.
+
+    Attributes:
+        tasks: their indices, such as `0-9,12`.
+        steps: of the snapshots, ascending.
+        run: of the parts.
+    """
+
+    tasks: str
+    steps: tuple[int, ...] = Field(min_length=1, max_length=MAX_STEPS)
+    run: str = Field(pattern=rf"^{RUN_NAME}$")
+
+    def __len__(self) -> int:
+        return count_ranges(self.tasks, limit=MAX_TASKS) * len(self.steps)
+
+    @property
+    def keys(self) -> Iterator[PartKey]:
+        """The parts."""
+        for task in read_ranges(self.tasks, limit=MAX_TASKS):
+            yield from (PartKey(task, step, self.run) for step in self.steps)
+
+
+class View(Record):
+    """A view file.
+
+    Attributes:
+        digest: sha256 of the canonical form of all other fields.
+        source: the dataset's folder, relative to the view's.
+        source_root: root of that dataset.
+        label: the view's own name.
+        derivation: how the parts were chosen, and their splits if these are not the source's.
+        totals: over the parts.
+        root: what the root of a dataset of these parts is.
+    """
+
+    schema_version: int
+    digest: str = Field(pattern=SHA256)
+    source: str = Field(min_length=1, max_length=4096)
+    source_root: str = Field(pattern=SHA256)
+    label: str | None = Field(max_length=200)
+    derivation: Derivation
+    totals: Totals
+    root: str = Field(pattern=SHA256)
+    parts: tuple[ViewedParts, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _is_no_larger_than_a_dataset(self) -> "View":
+        if sum(map(len, self.parts)) != self.totals.parts:
+            raise ValueError("totals.parts is not the number of its parts")
+        return self
+
+    @functools.cached_property
+    def keys(self) -> frozenset[PartKey]:
+        """The parts."""
+        return frozenset(key for group in self.parts for key in group.keys)
+
+    def manifest_of(self, source: Manifest, tasks: Iterable[int]) -> Manifest:
+        """The manifest of a dataset that holds the view's parts alone.
+
+        Args:
+            source: manifest of the source.
+            tasks: indices of the source's recorded tasks.
+        """
+        runs = [run.model_copy(update={"steps": None}) for run in source.runs]
+        changes = {
+            "digest": self.digest,
+            "label": self.label,
+            "derivation": self.derivation,
+            "runs": tuple(runs),
+            "dropped": tuple(sorted(set(tasks) - {key.task for key in self.keys})),
+            "totals": self.totals,
+            "root": self.root,
+            "complete": True,
+        }
+        return source.model_copy(update=changes)
+
+
+def is_view_file(path: str | Path) -> bool:
+    """Whether a path can only be that of a view: its name ends in `.json` and is not the manifest's."""
+    path = Path(path)
+    return path.suffix == ".json" and path.name != MANIFEST and not path.is_dir()
+
+
+def read_view(file: Path) -> View:
+    """Reads a view file.
+
+    Raises:
+        ManifestError: it is missing, truncated, edited, or of another schema version.
+    """
+    try:
+        data = read_plain_file(file, limit=MAX_JSON_BYTES)
+        values = parse_json(data)
+    except (FileNotFoundError, NotADirectoryError):
+        raise ManifestError(
+            f"{file} does not exist; make a view with `tcmrl-data derive --view {file}`"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise ManifestError(f"{file}: not a view ({one_line(error)}); derive it again") from None
+    view = parse_record(View, values, file, version=VIEW_SCHEMA)
+    fields = {key: value for key, value in values.items() if key != "digest"}
+    if digest(fields) != view.digest:
+        raise ManifestError(f"{file}: digest does not match its contents; the file was edited or damaged")
+    return view
+
+
+def write_view(
+    file: Path,
+    source: "Dataset",
+    keys: Iterable[PartKey],
+    *,
+    derivation: Derivation,
+    label: str | None,
+) -> None:
+    """Writes a view.
+
+    Args:
+        file: of the view; its name ends in `.json`.
+        source: the dataset, or a view of it.
+        keys: parts of the source, at least one.
+        derivation: how they were chosen.
+        label: the view's own name.
+
+    Raises:
+        StoreError: the file exists, its name is none for a view, or the view would be too large.
+    """
+    if not is_view_file(file):
+        raise StoreError(f"--view {file}: a view is a file whose name ends in .json, and is not {MANIFEST}")
+    if os.path.lexists(file):
+        raise StoreError(f"--view {file} exists; choose another name or remove it")
+    chosen = set(keys)
+    table = source.parts.only(chosen)
+    fields = {
+        "schema_version": VIEW_SCHEMA,
+        "source": os.path.relpath(source.folder.resolve(), file.parent.resolve()),
+        "source_root": source.sealed_root,
+        "label": label,
+        "derivation": derivation.model_dump(mode="json"),
+        "totals": totals_of(table).model_dump(),
+        "root": table.root,
+        "parts": [group.model_dump(mode="json") for group in _groups(chosen)],
+    }
+    data = canonical_json(fields | {"digest": digest(fields)})
+    try:
+        parse_json(data)
+    except ValueError as error:
+        raise StoreError(f"--view {file}: too many parts for a view ({error}); use --out instead") from None
+    replace_file(file, data)
+
+
+def _groups(keys: set[PartKey]) -> Iterator[ViewedParts]:
+    steps: dict[tuple[str, int], list[int]] = {}
+    for key in sorted(keys):
+        steps.setdefault((key.run, key.task), []).append(key.step)
+    tasks: dict[tuple[str, tuple[int, ...]], list[int]] = {}
+    for (run, task), members in steps.items():
+        tasks.setdefault((run, tuple(members)), []).append(task)
+    for (run, common), alike in sorted(tasks.items()):
+        yield ViewedParts(tasks=write_ranges(alike), steps=common, run=run)

@@ -1,0 +1,81 @@
+"""The environment of imported data that none of ours made: sizes, and nothing that could be simulated."""
+
+from typing import Any, Literal, NoReturn, final
+
+import numpy as np
+from pydantic import Field, model_validator
+
+from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
+from tcmrl_data.envs.controller import View
+from tcmrl_data.foundation.errors import SimulationError
+
+
+class ForeignSettings(EnvironmentSettings):
+    """What the data themselves tell of their environment.
+
+    Attributes:
+        tasks: number of tasks that were imported; one is enough.
+        train: number of training tasks among them; all may be.
+        horizon: steps of the longest episode.
+        observation_dim: width of observations.
+        action_dim: width of actions.
+        extra_arrays: dtypes of further per-step arrays, by name.
+    """
+
+    tasks: int = Field(ge=1)
+    train: int = Field(ge=0)
+    observation_dim: int = Field(ge=1)
+    action_dim: int = Field(ge=1)
+    extra_arrays: dict[str, Literal["float32", "int64", "bool"]] = Field(default={})
+
+    @model_validator(mode="after")
+    def _some_test_tasks(self) -> "ForeignSettings":
+        if self.train > self.tasks:
+            raise ValueError(f"train ({self.train}) must not be larger than tasks ({self.tasks})")
+        return self
+
+
+@final
+class Foreign(Environment):
+    """An environment of which only the data are known.
+
+    It is an environment, and its datasets have a recipe, so that every reader of a dataset finds sizes and
+    horizon where it always does. No recipe file can name it, and whatever needs a simulation is refused.
+    """
+
+    name = "foreign"
+    Settings = ForeignSettings
+    settings: ForeignSettings
+
+    def __init__(self, settings: ForeignSettings) -> None:
+        super().__init__(settings)
+        self.observation_dim, self.action_dim = settings.observation_dim, settings.action_dim
+        # of the class elsewhere, since one class has one simulator; here every dataset has its own
+        self.extras = {name: np.dtype(dtype).type for name, dtype in settings.extra_arrays.items()}  # type: ignore[misc]
+
+    @classmethod
+    def members(cls) -> list[str]:
+        """None that a build could name."""
+        return []
+
+    @classmethod
+    def provides(cls, name: str) -> bool:
+        return name == cls.name
+
+    def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
+        _refuse()
+
+    def make(self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored") -> NoReturn:
+        _refuse()
+
+
+def _refuse() -> NoReturn:
+    """Raises.
+
+    Raises:
+        SimulationError: always.
+    """
+    raise SimulationError(
+        "the data were imported without an environment, so that nothing can be simulated; import them again "
+        "with --environment NAME if they come from one that `tcmrl-data envs` lists"
+    )

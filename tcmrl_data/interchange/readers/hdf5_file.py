@@ -1,0 +1,208 @@
+"""HDF5 files of strangers: numbers and short texts of plain datasets, and nothing else.
+
+Links of any kind but hard ones, external and virtual storage, user-defined filters, and types without a fixed
+size are refused before they are followed. Compressed chunks are unpacked here first, up to the size that
+their dataset declares: the library would unpack whatever they hold.
+"""
+
+import contextlib
+import os
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import h5py
+import numpy as np
+import numpy.typing as npt
+
+from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.plain_files import one_line, printable
+from tcmrl_data.interchange.readers.source_files import decoded_limit, require_file
+
+MOST_MEMBERS = 2**20
+LARGEST_ATTRIBUTE = 2**20
+NUMBERS = "biuf"
+"""Kinds of the types that are read: truth values, integers, floats."""
+
+FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
+"""All others are either rare or code that is loaded from elsewhere."""
+
+_ERRORS = (
+    OSError,
+    RuntimeError,
+    KeyError,
+    ValueError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    MemoryError,
+    SystemError,
+)
+"""What h5py raises for damaged files."""
+
+
+class Hdf5File:
+    """An opened file; paths are absolute, such as `/episodes/000000/actions`.
+
+    Args:
+        path: the file.
+
+    Raises:
+        StoreError: it is missing or no HDF5; all methods raise it too, naming file and member.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._left = self._limit = decoded_limit(require_file(path).stat().st_size)
+        with self._named(""):
+            self._file = h5py.File(path, "r", locking=False, rdcc_nbytes=2**20)
+        self._raw = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        os.close(self._raw)
+        with contextlib.suppress(*_ERRORS):
+            self._file.close()
+
+    def members(self, group: str) -> list[str]:
+        """Names in a group, sorted."""
+        with self._named(group):
+            found = self._object(group)
+            if not isinstance(found, h5py.Group):
+                raise ValueError("is no group")
+            if len(found) > MOST_MEMBERS:
+                raise ValueError(f"has {len(found)} members, more than {MOST_MEMBERS}")
+            return sorted(name for name in found if isinstance(name, str))
+
+    def holds(self, path: str) -> bool:
+        """Whether there is a group or dataset at a path."""
+        with self._named(path):
+            return self._object(path) is not None
+
+    def is_group(self, path: str) -> bool:
+        """Whether there is a group at a path."""
+        with self._named(path):
+            return isinstance(self._object(path), h5py.Group)
+
+    def attribute(self, path: str, name: str) -> Any:
+        """A number or text; None where there is no such attribute."""
+        with self._named(f"{path} attribute {name}"):
+            found = self._object(path)
+            if found is None or not h5py.h5a.exists(found.id, name.encode()):
+                return None
+            opened = h5py.h5a.open(found.id, name.encode())
+            if opened.shape != () or opened.get_storage_size() > LARGEST_ATTRIBUTE:
+                raise ValueError("is no single value")
+            is_text = opened.get_type().get_class() == h5py.h5t.STRING
+            if not is_text and opened.dtype.kind not in NUMBERS:
+                raise ValueError(f"is of type {opened.dtype}")
+            value = found.attrs[name]
+            return value.decode() if isinstance(value, bytes) else value if is_text else value.item()
+
+    def rank(self, path: str) -> int | None:
+        """Number of dimensions of a dataset; None where there is none."""
+        with self._named(path):
+            found = self._object(path)
+            return len(found.shape or ()) if isinstance(found, h5py.Dataset) else None
+
+    def length(self, path: str) -> int:
+        """Number of rows of a dataset; 0 where there is none."""
+        with self._named(path):
+            found = self._object(path)
+            return int(found.shape[0]) if isinstance(found, h5py.Dataset) and found.shape else 0
+
+    def array(self, path: str) -> npt.NDArray[Any]:
+        """The values of a dataset, in the machine's byte order."""
+        with self._named(path):
+            found = self._object(path)
+            if not isinstance(found, h5py.Dataset):
+                raise ValueError("is missing" if found is None else "is no dataset")
+            self._check_form(found)
+            self._left -= found.nbytes
+            if self._left < 0:
+                raise ValueError(
+                    f"would take the values read beyond {self._limit} bytes, which the file's size does not "
+                    "justify; if you trust the file, write it again without compression (`h5repack -f NONE`)"
+                )
+            self._check_chunks(found)
+            values = np.asarray(found[()])
+            return values.astype(values.dtype.newbyteorder("="), copy=False)
+
+    def _object(self, path: str) -> Any:
+        """The group or dataset at a path, reached through hard links alone; None where there is none."""
+        found: Any = self._file
+        for name in filter(None, path.split("/")):
+            # `name in found` would follow the link, into another file too
+            if not isinstance(found, h5py.Group) or not found.id.links.exists(name.encode()):
+                return None
+            if found.id.links.get_info(name.encode()).type != h5py.h5l.TYPE_HARD:
+                raise ValueError("is reached through a soft or external link, which is not followed")
+            found = found[name]
+        return found
+
+    def _check_form(self, found: Any) -> None:
+        """Refuses a dataset whose values lie elsewhere, or whose type or filters are not plain."""
+        if found.dtype.kind not in NUMBERS or found.dtype.itemsize > 8 or found.dtype.subdtype:
+            raise ValueError(f"is of type {found.dtype}, not of numbers")
+        if found.shape is None or any(size < 0 for size in found.shape):
+            raise ValueError("has no shape")
+        if found.is_virtual or found.external:
+            raise ValueError("has its values in other files or datasets")
+        filters = _filters(found)
+        if set(filters) - FILTERS or len(set(filters)) < len(filters):
+            raise ValueError(f"has filters {filters}; only gzip, shuffle and fletcher32 are read")
+
+    def _check_chunks(self, found: Any) -> None:
+        """Refuses chunks that are larger than they say, or than the file justifies."""
+        if found.chunks is None:
+            return
+        chunk_bytes = int(np.prod(found.chunks, dtype=object)) * found.dtype.itemsize
+        if chunk_bytes > self._limit:
+            raise ValueError(f"has chunks of {chunk_bytes} bytes, which the file's size does not justify")
+        filters = _filters(found)
+        packed_bit = 1 << filters.index(h5py.h5z.FILTER_DEFLATE) if h5py.h5z.FILTER_DEFLATE in filters else 0
+        size = os.fstat(self._raw).st_size
+        problems: list[str] = []
+
+        def check(chunk: Any) -> None:
+            if problems or chunk.byte_offset is None:
+                return
+            if chunk.size > size:
+                problems.append("has a chunk that is larger than the file")
+            elif packed_bit and not chunk.filter_mask & packed_bit:
+                unpacker = zlib.decompressobj()
+                packed = os.pread(self._raw, chunk.size, chunk.byte_offset + self._file.userblock_size)
+                try:
+                    if len(unpacker.decompress(packed, chunk_bytes + 1)) > chunk_bytes:
+                        problems.append("has a chunk that unpacks to more than it should")
+                except zlib.error as error:
+                    problems.append(f"has a chunk that does not unpack ({error})")
+
+        found.id.chunk_iter(check)
+        if problems:
+            raise ValueError(problems[0])
+
+    @contextlib.contextmanager
+    def _named(self, member: str) -> Iterator[None]:
+        """Turns what h5py raises into an error that names the file and the member."""
+        try:
+            yield
+        except StoreError:
+            raise
+        except _ERRORS as error:
+            reason = one_line(error) or type(error).__name__
+            if not member:
+                raise StoreError(f"{self.path} does not open as HDF5 ({reason})") from None
+            raise StoreError(f"{self.path}: {printable(member)[:200]} {reason}") from None
+
+
+def _filters(dataset: h5py.Dataset) -> list[int]:
+    """The filters of a dataset's chunks, in the order in which they were applied."""
+    properties = dataset.id.get_create_plist()
+    return [properties.get_filter(index)[0] for index in range(properties.get_nfilters())]

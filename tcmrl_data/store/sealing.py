@@ -1,0 +1,89 @@
+"""Writing the tables and the manifest of a dataset whose parts are published."""
+
+from collections.abc import Collection, Sequence
+from pathlib import Path
+
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.foundation.disk import STAGING, replace_file
+from tcmrl_data.store.manifest import (
+    MANIFEST,
+    MANIFEST_SCHEMA,
+    Derivation,
+    Manifest,
+    Run,
+    Totals,
+    read_manifest,
+    seal,
+)
+from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartTable, part_line
+from tcmrl_data.store.platform import Platform
+from tcmrl_data.store.tables import seal_of
+from tcmrl_data.store.task_table import TASKS, task_line
+
+
+def totals_of(table: PartTable) -> Totals:
+    """The sums over the parts of a table."""
+    return Totals(
+        parts=len(table),
+        episodes=table.total("episodes"),
+        steps=table.total("steps"),
+        bytes=table.total("size"),
+    )
+
+
+def write_dataset(
+    folder: Path,
+    *,
+    name: str,
+    label: str | None,
+    data_version: int,
+    runs: Sequence[Run],
+    derivation: Derivation | None,
+    platforms: Sequence[Platform],
+    tasks: Sequence[Task],
+    dropped: Collection[int] = (),
+    table: PartTable,
+) -> Manifest:
+    """Writes the tables and then the manifest that seals them; the dataset exists from then on.
+
+    Args:
+        folder: the dataset, where the parts of the table are.
+        name: the environment's name.
+        label: the dataset's own name.
+        data_version: of the parts.
+        runs: how the parts were made; the first has a recipe.
+        derivation: how the dataset was derived from others.
+        platforms: of the parts; the table refers to them by position.
+        tasks: all tasks, dropped ones too.
+        dropped: indices of tasks that do not belong to the dataset.
+        table: all parts.
+
+    Raises:
+        StorageError: the operating system refuses an operation.
+    """
+    tables = {
+        TASKS: b"".join(task_line(task) for task in sorted(tasks, key=lambda task: task.index)),
+        PARTS_TABLE: HEADER + b"".join(map(part_line, table.entries())),
+    }
+    kept = table.without_tasks(dropped)
+    planned = [run.steps for run in runs if run.steps is not None]
+    expected = sum(map(len, planned)) * (len(tasks) - len(dropped)) if planned else len(kept)
+    fields = {
+        "schema_version": MANIFEST_SCHEMA,
+        "name": name,
+        "label": label,
+        "data_version": data_version,
+        "runs": [run.model_dump(mode="json") for run in runs],
+        "derivation": None if derivation is None else derivation.model_dump(mode="json"),
+        "platforms": [platform.model_dump(mode="json") for platform in platforms],
+        "tasks": seal_of(tables[TASKS]).model_dump(),
+        "parts": seal_of(tables[PARTS_TABLE]).model_dump(),
+        "dropped": sorted(dropped),
+        "totals": totals_of(kept).model_dump(),
+        "root": kept.root,
+        "complete": len(kept) == expected,
+    }
+    for file, data in tables.items():
+        replace_file(folder / file, data, staging=folder / STAGING)
+    replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
+    return read_manifest(folder)

@@ -1,0 +1,105 @@
+"""Deletion of a dataset, and of nothing else that lies in its folder."""
+
+import contextlib
+import stat
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from tcmrl_data.build.work_files import ASSEMBLY, TABLES, WORK_FILES, WORK_FOLDERS, check_work_files
+from tcmrl_data.foundation.disk import LOCK, disk, lock_file, lock_holder, named_errors, remove_tree
+from tcmrl_data.foundation.errors import LockedError, StoreError
+from tcmrl_data.store.keys import PARTS, key_of_file
+from tcmrl_data.store.manifest import MANIFEST, dataset_folder, read_manifest
+from tcmrl_data.verification.scan import Scan, scan_dataset
+
+NO_REMEDY = "delete the folder yourself if it is to go"
+
+
+@dataclass(frozen=True)
+class Deletion:
+    """What a deletion removed, or would remove.
+
+    Attributes:
+        files: number of files, without work files.
+        bytes: their size.
+        kept: files that are no part of a dataset, relative to the folder; they stay, and so does the folder.
+    """
+
+    dataset: Path
+    files: int
+    bytes: int
+    kept: tuple[str, ...]
+
+
+def delete_dataset(path: str | Path, *, dry_run: bool = False) -> Deletion:
+    """Deletes a dataset, or what a stopped build or derivation left of one.
+
+    The manifest goes first, so that an interrupted deletion leaves no dataset that lacks parts; the same call
+    goes on. Files that are no part of a dataset stay and are named.
+
+    Args:
+        path: the dataset's folder or its `manifest.json`.
+        dry_run: only say what would be removed.
+
+    Raises:
+        StoreError: there is no dataset at the path, or the path is a link or a view.
+        ManifestError: the manifest is damaged, so that it is not sure that this is a dataset.
+        LockedError: a process works on the dataset; names it.
+        BuildError: its work files are links.
+
+    Example:
+        >>> delete_dataset("data/point-robot-medium", dry_run=True)  # doctest: +SKIP
+    """
+    folder = dataset_folder(path)
+    if folder.is_symlink() or not folder.is_dir():
+        kind = "a link" if folder.is_symlink() else "a file" if folder.exists() else "not there"
+        raise StoreError(f"{folder} is {kind}, not the folder of a dataset; {NO_REMEDY}")
+    if (folder / MANIFEST).exists():
+        read_manifest(folder)
+    elif not any((folder / name).exists() for name in (PARTS, ASSEMBLY)):
+        raise StoreError(f"{folder} holds no dataset; {NO_REMEDY}")
+    check_work_files(folder)
+    holder = lock_holder(folder / LOCK)
+    if holder is not None:
+        raise LockedError(f"dataset {folder} is being written by {holder}; wait for it or stop it")
+    if dry_run:
+        return _deletion(folder, scan_dataset(folder))
+    with lock_file(folder / LOCK, f"dataset {folder}"), named_errors(folder):
+        scan = scan_dataset(folder)
+        _remove(folder, scan)
+    return _deletion(folder, scan)
+
+
+def _deletion(folder: Path, scan: Scan) -> Deletion:
+    own = [status.st_size for file, status in scan.files.items() if _is_own(file, status.st_mode)]
+    kept = [file for file, status in scan.files.items() if not _is_own(file, status.st_mode)]
+    return Deletion(folder, len(own), sum(own), tuple(sorted([*kept, *scan.problems])))
+
+
+def _is_own(file: str, mode: int) -> bool:
+    """Whether a file is one that a dataset has: a plain file of such a name."""
+    return stat.S_ISREG(mode) and (file in {MANIFEST, *TABLES} or key_of_file(file) is not None)
+
+
+def _remove(folder: Path, scan: Scan) -> None:
+    if MANIFEST in scan.files:
+        (folder / MANIFEST).unlink()
+        disk.sync(folder)
+    for name in WORK_FOLDERS:
+        remove_tree(folder / name)
+    own = [folder / file for file, status in scan.files.items() if _is_own(file, status.st_mode)]
+    for file in own:
+        file.unlink(missing_ok=True)
+    _remove_empty({parent for file in own for parent in file.parents if folder in parent.parents})
+    _remove_empty(folder / place for place in scan.empty_folders if place.startswith(f"{PARTS}"))
+    for name in WORK_FILES:
+        (folder / name).unlink(missing_ok=True)
+    _remove_empty([folder])
+
+
+def _remove_empty(folders: Iterable[Path]) -> None:
+    """Removes folders that hold nothing, the deepest first."""
+    for folder in sorted(folders, reverse=True):
+        with contextlib.suppress(OSError):
+            folder.rmdir()
