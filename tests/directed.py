@@ -105,7 +105,7 @@ def _work(spec: dict[str, Any], report: Report) -> str:
     class HalfWritten(disk.Disk):
         def write(self, path: Path, data: bytes) -> None:
             super().write(path, data)
-            if directions.at == "publishing" and disk.STAGING in path.parts and path.name == "policy.json":
+            if directions.at == "publishing" and disk.STAGING in path.parts and ".zip." in path.name:
                 directions.obey()
 
     def report_and_obey(message: Mapping[str, Any]) -> None:

@@ -277,11 +277,11 @@ def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_do
         worker.stdin.write(json.dumps(directed.spec) + "\n")
         worker.stdin.flush()
         halfway.wait(worker)
-        assert len(staged(tmp_path / "data")) == 2  # a half written part and its lock
+        assert len(staged(tmp_path / "data")) == 1  # a part that is not yet synced
         worker.terminate()
         assert worker.wait(PATIENCE) == 128 + signal.SIGTERM
     assert staged(tmp_path / "data") == []
-    assert list((tmp_path / "data").rglob("part.json")) == []
+    assert list((tmp_path / "data").rglob("*.zip")) == []
     assert run(EngineCase("local", None, ""), [unit])["task 40"].digest == reference(tiny, 40)
 
 

@@ -9,7 +9,13 @@ from pathlib import Path
 from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.published import Published, read_published
 from tcmrl_data.foundation.disk import STAGING, named_errors, replace_file
-from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError, UnreadableError
+from tcmrl_data.foundation.errors import (
+    BuildError,
+    ManifestError,
+    StorageError,
+    StoreError,
+    UnreadableError,
+)
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem
 from tcmrl_data.foundation.shared_folder import wait_until_visible
@@ -166,16 +172,14 @@ class Ledger:
     def seal(self) -> None:
         """Writes the manifest and cuts off what stands behind the tables, unless this is so already.
 
-        After Ctrl-C between the line of a part and its entry here, the old manifest stays: the next build
-        takes the line from the log.
-
         Raises:
             StorageError: the operating system refuses an operation; the old manifest is unchanged.
         """
         began = time.monotonic()
+        unwritten = 1 + len(self._table) + len(self._new) - self._part_writer.seal.lines
+        if unwritten:  # after Ctrl-C between the entry of a part and its line
+            self._part_writer.append(b"".join(map(part_line, self._new[-unwritten:])))
         self._table, self._new = self._table.with_entries(self._new), []
-        if self._part_writer.seal.lines != 1 + len(self._table):
-            return
         data = self._manifest()
         if not self._is_written(data) or self._has_more():
             self._task_writer.sync()
@@ -236,8 +240,12 @@ class Ledger:
             digests.append(digest)
             self.seal()  # lines behind the seal name platforms by their position in the manifest
         entry = published.entry._replace(platform=digests.index(digest))
-        self._part_writer.append(part_line(entry))
         self._new.append(entry)
+        try:
+            self._part_writer.append(part_line(entry))
+        except StorageError:
+            self._new.pop()
+            raise
 
     def _add(self, key: PartKey) -> None:
         """Counts a part."""

@@ -53,8 +53,8 @@ class PartMaker:
             self._lanes.close()
             self._lanes = None
 
-    def publish(self, snapshot: Snapshot) -> Published:
-        """Publishes the part of a snapshot; one that is there already is read and left alone.
+    def publish(self, snapshot: Snapshot) -> Published | None:
+        """Publishes the part of a snapshot; one that is there already is left alone, and None is returned.
 
         Raises:
             NondeterminismError: the part that is there was made on an equal platform from another policy.
@@ -64,13 +64,13 @@ class PartMaker:
             record, data = self._make(snapshot)
             replace_file(file, data, staging=self._dataset / STAGING)
             return Published.of_record(record, run=MAIN_RUN, archive=data)
-        published, record = read_published(file, MAIN_RUN)
+        _, record = read_published(file, MAIN_RUN)
         same_platform = record.platform.digest() == self._plan.platform.digest()
         if same_platform and record.identity.policy != snapshot.digest():
             raise NondeterminismError(
                 f"{file}: its policy differs from the one trained now with the same seed"
             )
-        return published
+        return None
 
     def _make(self, snapshot: Snapshot) -> tuple[PartRecord, bytes]:
         """The record and the archive of the snapshot's part."""

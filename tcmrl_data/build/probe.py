@@ -119,7 +119,9 @@ def _measure_parts(spec: UnitSpec, plan: BuildPlan, task: Task, snapshot: Snapsh
         maker = PartMaker(Path(name), plan, task=task, behavior={})
         for step in (0, 1):
             started = time.monotonic()
-            found = maker.publish(dataclasses.replace(snapshot, step=step)).entry
+            published = maker.publish(dataclasses.replace(snapshot, step=step))
+            assert published is not None  # the folder is new
+            found = published.entry
             if len(spec.tasks) > 1:
                 maker.close()
             seconds.append((time.monotonic() - started) * batches)

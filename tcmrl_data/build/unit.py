@@ -100,7 +100,9 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
             if task.index not in makers:
                 makers[task.index] = PartMaker(spec.dataset, plan, task=task, behavior=recorded)
                 stack.callback(makers[task.index].close)
-            report(makers[task.index].publish(snapshot).to_message())
+            published = makers[task.index].publish(snapshot)
+            if published is not None:
+                report(published.to_message())
             # simulators of many tasks would fill the memory: a group makes them anew for every part
             if snapshot.step == source.steps[-1] or len(wanted) > 1:
                 makers[task.index].close()
