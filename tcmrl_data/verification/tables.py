@@ -1,11 +1,11 @@
 """Writing the tables of a dataset again, from the parts or with other lines for some of them."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from tcmrl_data.build.published import Published, read_published
+from tcmrl_data.build.published import Published, numbered, read_published
 from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
@@ -13,7 +13,7 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.keys import PartKey, key_of_file, part_file
 from tcmrl_data.store.manifest import MANIFEST, Manifest, seal
-from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartEntry, PartTable, parse_parts, part_line
+from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartTable, parse_parts, part_line
 from tcmrl_data.store.platform import Platform
 from tcmrl_data.store.tables import read_sealed, seal_of
 from tcmrl_data.store.task_table import TASKS, parse_tasks, task_line
@@ -71,18 +71,6 @@ def write_tables(
     kept = table.without_tasks(manifest.dropped)
     fields["totals"]["bytes"] = kept.total("size")
     replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
-
-
-def numbered(parts: Iterable[Published], platforms: list[Platform]) -> list[PartEntry]:
-    """The parts' lines with the positions of their platforms; adds new platforms to the list."""
-    positions = {platform.digest(): position for position, platform in enumerate(platforms)}
-    entries = []
-    for part in parts:
-        position = positions.setdefault(part.platform.digest(), len(platforms))
-        if position == len(platforms):
-            platforms.append(part.platform)
-        entries.append(part.entry._replace(platform=position))
-    return entries
 
 
 def _read_parts(folder: Path) -> list[Published]:

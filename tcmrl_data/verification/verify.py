@@ -34,6 +34,7 @@ from tcmrl_data.store.manifest import (
 from tcmrl_data.store.part_files import check_members, identity_problems
 from tcmrl_data.store.part_record import PartRecord, read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, PartTable, parse_parts
+from tcmrl_data.store.sealing import is_complete
 from tcmrl_data.store.tables import read_sealed
 from tcmrl_data.store.task_table import TASKS, parse_tasks
 from tcmrl_data.verification.contents import content_problems, task_problems
@@ -256,7 +257,7 @@ class _Verification:
             "totals.episodes": kept.total("episodes"),
             "totals.steps": kept.total("steps"),
             "totals.bytes": kept.total("size"),
-            "complete": len(kept) == manifest.num_expected,
+            "complete": is_complete(kept, manifest.runs, num_tasks=manifest.num_tasks),
         }
         found = manifest.model_dump(include={"root", "totals", "complete"})
         found |= {f"totals.{name}": value for name, value in found["totals"].items()}
@@ -272,6 +273,8 @@ class _Verification:
                 "is a part of a dropped task that the manifest does not name; delete it, or build with "
                 f"--tasks {key.task}"
             )
+        if key and key.run not in self._runs:
+            return "is a part that the manifest does not name; the command that made it takes it in"
         return "is a part that the manifest does not name; `tcmrl-data build` takes it in if it holds"
 
     def _check_part(self, file: str, entry: PartEntry | None) -> list[Finding]:
