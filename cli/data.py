@@ -16,6 +16,7 @@ from .inspection import inspect
 from .plugins import FORMAT
 from .progress import StageProgress
 from .recipes import recipe
+from .remaking import extend
 from .show import show
 from .status import status
 from .verification import gc, import_policy, repair, verify
@@ -61,6 +62,7 @@ for _command in (
     split,
     rename,
     delete,
+    extend,
 ):
     data.add_command(_command)
 

@@ -11,6 +11,8 @@ from .build.plan import BuildPlan as BuildPlan
 from .build.plan import plan_build as plan_build
 from .curation.derive import Derived as Derived
 from .curation.derive import derive_dataset as derive_dataset
+from .curation.extend import ExtendReport as ExtendReport
+from .curation.extend import extend_dataset as extend_dataset
 from .curation.merge import merge_datasets as merge_datasets
 from .curation.rename import rename_dataset as rename_dataset
 from .curation.split import split_dataset as split_dataset

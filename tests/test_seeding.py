@@ -58,4 +58,5 @@ def test_purposes_keep_their_numbers() -> None:
         "BEHAVIOR_UPDATE": 13,
         "SUBSET": 14,
         "FOLDS": 15,
+        "EXTENSION_NOISE": 16,
     }

@@ -34,6 +34,7 @@ from tcmrl_data.store.part_table import (
     parse_parts,
     part_line,
 )
+from tcmrl_data.store.sealing import is_complete
 from tcmrl_data.store.tables import TableWriter, read_log, read_sealed
 from tcmrl_data.store.task_table import TASKS, parse_tasks, task_line
 
@@ -204,6 +205,7 @@ class Ledger:
         """The manifest of what is there."""
         plan, earlier, table = self.plan, self._earlier, self._kept_parts()
         main = Run(name=MAIN_RUN, kind="built", seed=plan.seed, recipe=plan.recipe, steps=plan.source.steps)
+        runs = [main, *(earlier.runs[1:] if earlier else ())]
         totals = Totals(
             parts=len(table),
             episodes=table.total("episodes"),
@@ -215,7 +217,7 @@ class Ledger:
             "name": plan.environment.name,
             "label": earlier.label if earlier else None,
             "data_version": DATA_VERSION,
-            "runs": [main.model_dump(mode="json")],
+            "runs": [run.model_dump(mode="json") for run in runs],
             "derivation": None,
             "platforms": [platform.model_dump(mode="json") for platform in self.platforms],
             "tasks": self._task_writer.seal.model_dump(),
@@ -223,7 +225,7 @@ class Ledger:
             "dropped": sorted(plan.dropped),
             "totals": totals.model_dump(),
             "root": table.root,
-            "complete": len(table) == len(self._steps) * len(plan.source.steps),
+            "complete": is_complete(table, runs, num_tasks=len(self._steps)),
         }
         return seal(fields)
 

@@ -9,8 +9,8 @@ import numpy as np
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.published import Published, read_published
-from tcmrl_data.envs.base import Environment, Lanes
-from tcmrl_data.envs.controller import Controller, UniformController
+from tcmrl_data.envs.base import Environment, Lanes, Parameters
+from tcmrl_data.envs.controller import Controller, NoisyController, UniformController
 from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
@@ -79,7 +79,7 @@ class PartMaker:
             self._lanes = plan.environment.lanes(self._parameters)
         trajectories = roll_out_part(plan, task=task, snapshot=snapshot, lanes=self._lanes)
         place = f"{plan.environment.name}, task {task.index}, snapshot step {snapshot.step}"
-        _check_finite(trajectories, place)
+        check_finite(trajectories, place)
         if self._references is None:
             self._references = self._measure_references()
         return seal_part(
@@ -104,11 +104,11 @@ class PartMaker:
                 environment,
                 lanes,
                 controller,
-                num_episodes=self._plan.recipe.rollouts.episodes,
+                episodes=range(self._plan.recipe.rollouts.episodes),
                 reset_key=(*key, Purpose.REFERENCE_RESET),
                 noise_key=(*key, Purpose.REFERENCE_NOISE),
             )
-            _check_finite(trajectories, f"{environment.name}, task {self.task.index}, reference rollouts")
+            check_finite(trajectories, f"{environment.name}, task {self.task.index}, reference rollouts")
             return float(np.mean([trajectory.undiscounted_return for trajectory in trajectories]))
 
         uniform = mean_return(UniformController())
@@ -152,18 +152,39 @@ def seal_part(
     )
 
 
-def roll_out_part(plan: BuildPlan, *, task: Task, snapshot: Snapshot, lanes: Lanes) -> list[Trajectory]:
-    """The recipe's episodes of one snapshot, in lane batches; every episode has its own keyed seeds."""
+def roll_out_part(
+    plan: BuildPlan,
+    *,
+    task: Task,
+    snapshot: Snapshot,
+    lanes: Lanes,
+    policy_parameters: Parameters | None = None,
+    first_episode: int = 0,
+    noise: float = 0.0,
+) -> list[Trajectory]:
+    """The recipe's episodes of one snapshot, in lane batches; every episode has its own keyed seeds.
+
+    Args:
+        plan: of the build.
+        task: in which the policy acts.
+        snapshot: the policy.
+        lanes: of the task.
+        policy_parameters: of the task that the policy was made for; None for `task`.
+        first_episode: number of the first episode; a multiple of the lanes, so that batches are the same.
+        noise: standard deviation of normal noise that is added to actions.
+    """
     environment = plan.environment
-    controller = snapshot.controller(environment, [task.parameters] * lanes.num_lanes)
+    parameters = task.parameters if policy_parameters is None else policy_parameters
+    controller = snapshot.controller(environment, [parameters] * lanes.num_lanes)
     key = (plan.seed, environment.name, task.index)
     return _roll_out_batches(
         environment,
         lanes,
         controller,
-        num_episodes=plan.recipe.rollouts.episodes,
+        episodes=range(first_episode, first_episode + plan.recipe.rollouts.episodes),
         reset_key=(*key, Purpose.ROLLOUT_RESET, snapshot.step),
         noise_key=(*key, Purpose.ROLLOUT_NOISE, snapshot.step),
+        added_noise=(noise, (*key, Purpose.EXTENSION_NOISE, snapshot.step)) if noise else None,
     )
 
 
@@ -176,24 +197,29 @@ def _roll_out_batches(
     lanes: Lanes,
     controller: Controller,
     *,
-    num_episodes: int,
+    episodes: range,
     reset_key: StreamKey,
     noise_key: StreamKey,
+    added_noise: tuple[float, StreamKey] | None = None,
 ) -> list[Trajectory]:
     trajectories: list[Trajectory] = []
-    for first in range(0, num_episodes, lanes.num_lanes):
-        episodes = range(first, first + lanes.num_lanes)
+    for first in range(episodes.start, episodes.stop, lanes.num_lanes):
+        batch = range(first, first + lanes.num_lanes)
+        acting = controller
+        if added_noise is not None:
+            sigma, key = added_noise
+            acting = NoisyController(controller, sigma, [keyed_generator(*key, episode) for episode in batch])
         trajectories += roll_out(
             environment,
             lanes,
-            controller,
-            reset_seeds=[keyed_seed(*reset_key, episode) for episode in episodes],
-            noise=[keyed_generator(*noise_key, episode) for episode in episodes],
+            acting,
+            reset_seeds=[keyed_seed(*reset_key, episode) for episode in batch],
+            noise=[keyed_generator(*noise_key, episode) for episode in batch],
         )
     return trajectories
 
 
-def _check_finite(trajectories: Sequence[Trajectory], place: str) -> None:
+def check_finite(trajectories: Sequence[Trajectory], place: str) -> None:
     """Refuses episodes with values that are not finite.
 
     Raises:

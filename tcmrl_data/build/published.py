@@ -1,6 +1,6 @@
 """A published part, as a worker reports it to the driver or as it is found on disk."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -55,3 +55,15 @@ def read_published(file: Path, run: str) -> tuple[Published, PartRecord]:
         for name in archive.names:
             archive.read(name)  # compares its checksum
         return Published.of_record(record, run=run, archive=archive.content()), record
+
+
+def numbered(parts: Iterable[Published], platforms: list[Platform]) -> list[PartEntry]:
+    """The parts' lines with the positions of their platforms; adds new platforms to the list."""
+    positions = {platform.digest(): position for position, platform in enumerate(platforms)}
+    entries = []
+    for part in parts:
+        position = positions.setdefault(part.platform.digest(), len(platforms))
+        if position == len(platforms):
+            platforms.append(part.platform)
+        entries.append(part.entry._replace(platform=position))
+    return entries

@@ -164,6 +164,10 @@ class Assembly:
             record, data = make()
             replace_file(file, data, staging=self._out / STAGING)
             published = Published.of_record(record, run=key.run, archive=data)
+        return self.take(published)
+
+    def take(self, published: Published) -> PartEntry:
+        """Adds a part that another process has published in the folder."""
         return self._add(published.entry, published.platform)
 
     def finish(

@@ -12,6 +12,9 @@ from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import Derivation, Manifest, Run
 from tcmrl_data.store.part_record import PartRecord
 
+SIMULATED_KINDS = ("built", "extended", "relabelled")
+"""Kinds of runs whose parts can be made again by the simulator, unless they are cut."""
+
 Progress = Callable[[int, int], None]
 """Called with parts done and parts in all."""
 
@@ -128,7 +131,7 @@ def settle_runs(
         run.model_copy(
             update={
                 "steps": run.steps if has_all else None,
-                "kind": "subset" if run.name in cut and run.kind == "built" else run.kind,
+                "kind": "subset" if run.name in cut and run.kind in SIMULATED_KINDS else run.kind,
             }
         )
         for run in sorted(kept, key=lambda run: run.recipe is None)

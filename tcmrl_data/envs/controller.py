@@ -1,6 +1,7 @@
 """Base class of controllers, which choose the actions of a batch of lanes."""
 
 import abc
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal, final
 
@@ -71,3 +72,49 @@ class UniformController(Controller):
 
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         return noise
+
+
+@final
+class NoisyController(Controller):
+    """Another controller's actions with normal noise added, for one rollout.
+
+    Args:
+        controller: whose actions these are.
+        sigma: standard deviation of the noise; rollouts clip the sum to [-1, 1].
+        generators: of the noise, one per lane, so that the controller's own noise stays what it is.
+    """
+
+    def __init__(
+        self, controller: Controller, sigma: float, generators: Iterable[np.random.Generator]
+    ) -> None:
+        self.view = controller.view
+        self._controller, self._sigma, self._generators = controller, sigma, iter(generators)
+
+    def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
+        own = self._controller.draw_noise(generator, num_steps, action_dim)
+        more = next(self._generators).standard_normal((num_steps, action_dim), dtype=np.float32)
+        return np.concatenate([own, more], axis=1)
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        own, more = np.split(noise, 2, axis=1)
+        return self._controller.act(observations, own) + np.float32(self._sigma) * more
+
+    def observe(self, transition: Transition) -> None:
+        self._controller.observe(transition)
+
+
+@final
+class PlaybackController(Controller):
+    """Plays stored actions, whatever it observes, for one rollout.
+
+    Args:
+        actions: (steps, action_dim) of every lane; zeros follow where a lane's actions end.
+    """
+
+    def __init__(self, actions: Iterable[FloatArray]) -> None:
+        self._actions, self._step = list(actions), 0
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        step, self._step = self._step, self._step + 1
+        nothing = np.zeros(noise.shape[1], dtype=np.float32)
+        return np.stack([actions[step] if step < len(actions) else nothing for actions in self._actions])

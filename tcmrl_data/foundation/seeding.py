@@ -28,6 +28,7 @@ class Purpose(enum.IntEnum):
     BEHAVIOR_UPDATE = 13
     SUBSET = 14
     FOLDS = 15
+    EXTENSION_NOISE = 16
 
 
 def environment_key(environment: str) -> int:

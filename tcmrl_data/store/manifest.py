@@ -44,6 +44,7 @@ class Run(Record):
             imported and recorded episodes says of which environment they are, and no rollouts.
         origin: where its parts come from, if they were not built.
         steps: snapshot steps that every task is to have; null where no more is expected than there is.
+        sources: pairs of a task and the other task whose policy or episodes its parts come from, ascending.
     """
 
     name: str = Field(pattern=rf"^{RUN_NAME}$")
@@ -52,12 +53,20 @@ class Run(Record):
     recipe: Recipe | None
     origin: dict[str, Any] | None = None
     steps: tuple[_Index, ...] | None
+    sources: tuple[tuple[int, int], ...] = Field(default=(), max_length=MAX_TASKS)
 
     @model_validator(mode="after")
-    def _steps_are_sorted(self) -> "Run":
+    def _are_sorted(self) -> "Run":
         if self.steps is not None and list(self.steps) != sorted(set(self.steps)):
             raise ValueError("steps must be sorted, each once")
+        tasks = [task for task, _ in self.sources]
+        if tasks != sorted(set(tasks)):
+            raise ValueError("sources must be sorted, each task once")
         return self
+
+    def source_of(self, task: int) -> int:
+        """The task that the run's parts of a task come from, which is the same one for rollouts in it."""
+        return dict(self.sources).get(task, task)
 
 
 class Source(Record):
@@ -193,9 +202,9 @@ class Manifest(Record):
 
     @property
     def num_expected(self) -> int:
-        """Number of parts of the complete dataset."""
-        planned = [run.steps for run in self.runs if run.steps is not None]
-        return sum(map(len, planned)) * self.num_tasks if planned else self.totals.parts
+        """Number of parts of the complete dataset, with those that no run plans."""
+        planned = sum(len(run.steps) for run in self.runs if run.steps is not None) * self.num_tasks
+        return max(planned, self.totals.parts)
 
     @model_validator(mode="after")
     def _agrees_with_itself(self) -> "Manifest":

@@ -13,6 +13,9 @@ from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part_record import RECORD, PartRecord
 from tcmrl_data.store.part_table import REFERENCES, STATISTICS, PartEntry
 
+DERIVED_KINDS = ("extended", "relabelled")
+"""Kinds of runs whose parts name the task that their policy or their episodes come from."""
+
 POLICY = ("policy.json", "policy.safetensors")
 """The snapshot; the second file is missing where the policy has no weights."""
 
@@ -79,6 +82,11 @@ def identity_problems(
             yield f"{name} is not the manifest's"
     if settings is not None and not same_settings(identity.settings, settings):
         yield "identity.settings is not the manifest's"
+    made = (identity.derived or {}).get("settings")
+    if run.kind in DERIVED_KINDS and (
+        not isinstance(made, dict) or made.get("task") != run.source_of(task.index)
+    ):
+        yield "identity.derived.settings.task is not the manifest's"
     for name in STATISTICS:
         if getattr(record.statistics, name) != getattr(entry, name):
             yield f"statistics.{name} is not that of parts.jsonl"

@@ -202,6 +202,12 @@ class PartTable:
         records["run"] = np.array(self.runs, dtype="S64")[self.columns["run"]]
         return sha256(records.tobytes())
 
+    def num_parts(self, run: str) -> int:
+        """Number of parts of a run."""
+        if run not in self.runs:
+            return 0
+        return int((self.columns["run"] == self.runs.index(run)).sum())
+
     def total(self, column: str) -> int:
         """Sum of a column of counts."""
         return int(self.columns[column].sum())

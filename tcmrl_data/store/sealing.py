@@ -66,8 +66,6 @@ def write_dataset(
         PARTS_TABLE: HEADER + b"".join(map(part_line, table.entries())),
     }
     kept = table.without_tasks(dropped)
-    planned = [run.steps for run in runs if run.steps is not None]
-    expected = sum(map(len, planned)) * (len(tasks) - len(dropped)) if planned else len(kept)
     fields = {
         "schema_version": MANIFEST_SCHEMA,
         "name": name,
@@ -81,9 +79,22 @@ def write_dataset(
         "dropped": sorted(dropped),
         "totals": totals_of(kept).model_dump(),
         "root": kept.root,
-        "complete": len(kept) == expected,
+        "complete": is_complete(kept, runs, num_tasks=len(tasks) - len(dropped)),
     }
     for file, data in tables.items():
         replace_file(folder / file, data, staging=folder / STAGING)
     replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
     return read_manifest(folder)
+
+
+def is_complete(table: PartTable, runs: Sequence[Run], *, num_tasks: int) -> bool:
+    """Whether every task has the snapshots that the runs plan.
+
+    Args:
+        table: parts of the tasks that belong to the dataset.
+        runs: of the dataset.
+        num_tasks: number of those tasks.
+    """
+    return all(
+        table.num_parts(run.name) == len(run.steps) * num_tasks for run in runs if run.steps is not None
+    )

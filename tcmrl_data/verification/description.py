@@ -9,6 +9,7 @@ from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import words_after
 from tcmrl_data.store.manifest import MANIFEST, Manifest, TableSeal, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_parts
+from tcmrl_data.store.sealing import is_complete
 from tcmrl_data.store.tables import read_sealed
 from tcmrl_data.store.task_table import TASKS, parse_tasks
 from tcmrl_data.verification.findings import Finding, finding
@@ -91,7 +92,7 @@ class Description:
             "totals.episodes": kept.total("episodes"),
             "totals.steps": kept.total("steps"),
             "totals.bytes": kept.total("size"),
-            "complete": len(kept) == manifest.num_expected,
+            "complete": is_complete(kept, manifest.runs, num_tasks=manifest.num_tasks),
         }
         found = manifest.model_dump(include={"root", "totals", "complete"})
         found |= {f"totals.{name}": value for name, value in found["totals"].items()}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from tcmrl_data.build.build import build_dataset
 from tcmrl_data.build.events import BuildEvent
-from tcmrl_data.build.published import Published, read_published
+from tcmrl_data.build.published import Published, numbered, read_published
 from tcmrl_data.build.work_files import check_work_files
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import (
@@ -29,7 +29,7 @@ from tcmrl_data.store.manifest import Run, dataset_folder, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification.findings import Finding, VerifyLevel
-from tcmrl_data.verification.tables import numbered, restore_tables, write_tables
+from tcmrl_data.verification.tables import restore_tables, write_tables
 from tcmrl_data.verification.verify import find_problems, verify_dataset
 
 REPAIR = "repair"

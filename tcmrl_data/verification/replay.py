@@ -12,6 +12,8 @@ from pydantic import ValidationError
 from tcmrl_data.behavior.snapshot import read_snapshot
 from tcmrl_data.build.part import roll_out_part
 from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.curation.derived import read_settings
+from tcmrl_data.curation.extension import EXTEND, Extension, extended_episodes
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.recipe.recipe import Recipe
@@ -75,7 +77,7 @@ def replay_part(archive: Archive, record: PartRecord, key: PartKey, recipe: Reci
         task = Task(identity.task, "train", identity.parameters)  # the split has no part in rollouts
         plan = BuildPlan.of_tasks(recipe, seed=identity.seed, tasks=[task])
         differences = tuple(plan.platform.differences(record.platform))
-        made = _make_again(archive, identity.step, plan)
+        made = _make_again(archive, record, plan)
         stored = read_arrays(archive, identity.arrays)
         compare = _drift_problems if differences else _bit_problems
         problems = tuple(compare(stored, made))
@@ -93,12 +95,18 @@ def _check_cost(archive: Archive, record: PartRecord, recipe: Recipe) -> None:
         raise ValueError(f"{lanes} lanes of {horizon} steps are more than the part's size justifies")
 
 
-def _make_again(archive: Archive, step: int, plan: BuildPlan) -> dict[str, npt.NDArray[Any]]:
+def _make_again(archive: Archive, record: PartRecord, plan: BuildPlan) -> dict[str, npt.NDArray[Any]]:
     (task,) = plan.tasks
-    snapshot = read_snapshot(archive.read, step, place=str(archive.path))
+    derived, place = record.identity.derived, str(archive.path)
+    snapshot = read_snapshot(archive.read, record.identity.step, place=place)
     parameters = [task.parameters] * plan.recipe.rollouts.lanes
     with _one_thread(), contextlib.closing(plan.environment.lanes(parameters)) as lanes:
-        return pack(roll_out_part(plan, task=task, snapshot=snapshot, lanes=lanes))
+        if derived is None:
+            return pack(roll_out_part(plan, task=task, snapshot=snapshot, lanes=lanes))
+        if derived.get("operation") == EXTEND:
+            extension = read_settings(Extension, derived, place)
+            return pack(extended_episodes(plan, snapshot, extension, lanes))
+    raise ValueError(f"it is the result of {str(derived.get('operation'))[:40]!r}, not of rollouts")
 
 
 @contextlib.contextmanager

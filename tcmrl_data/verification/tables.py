@@ -1,12 +1,12 @@
 """Writing the tables of a dataset again, from the parts or with other lines for some of them."""
 
 import contextlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from tcmrl_data.build.published import Published, read_published
+from tcmrl_data.build.published import Published, numbered, read_published
 from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
@@ -17,7 +17,6 @@ from tcmrl_data.store.manifest import MANIFEST, Manifest, seal
 from tcmrl_data.store.part_table import (
     HEADER,
     PARTS_TABLE,
-    PartEntry,
     PartTable,
     parse_entries,
     parse_parts,
@@ -81,18 +80,6 @@ def write_tables(
     kept = table.without_tasks(manifest.dropped)
     fields["totals"]["bytes"] = kept.total("size")
     replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
-
-
-def numbered(parts: Iterable[Published], platforms: list[Platform]) -> list[PartEntry]:
-    """The parts' lines with the positions of their platforms; adds new platforms to the list."""
-    positions = {platform.digest(): position for position, platform in enumerate(platforms)}
-    entries = []
-    for part in parts:
-        position = positions.setdefault(part.platform.digest(), len(platforms))
-        if position == len(platforms):
-            platforms.append(part.platform)
-        entries.append(part.entry._replace(platform=position))
-    return entries
 
 
 def _recover_parts(folder: Path, manifest: Manifest, platforms: list[Platform]) -> PartTable:

@@ -216,4 +216,6 @@ def _unnamed(file: str, manifest: Manifest) -> str:
             "is a part of a dropped task that the manifest does not name; delete it, or build with "
             f"--tasks {key.task}"
         )
+    if key and key.run not in {run.name for run in manifest.runs}:
+        return "is a part that the manifest does not name; the command that made it takes it in"
     return "is a part that the manifest does not name; `tcmrl-data build` takes it in if it holds"

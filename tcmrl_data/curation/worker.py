@@ -1,0 +1,18 @@
+"""The process that makes parts from stored ones: `python -m tcmrl_data.curation.worker`."""
+
+from typing import Any
+
+from tcmrl_data.curation.publishing import publish_parts
+from tcmrl_data.curation.remaking import RemakeSpec
+from tcmrl_data.engine.worker import Send, serve
+
+
+def _remake(spec: dict[str, Any], report: Send) -> str:
+    import torch
+
+    torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently
+    return publish_parts(RemakeSpec.from_json(spec), report)
+
+
+if __name__ == "__main__":
+    serve(_remake)
