@@ -6,13 +6,13 @@ parts out again. Beside a running build, a verification checks what the manifest
 """
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from tcmrl_data.dataset.dataset import open_dataset
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.view import is_view_file
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import sha256
@@ -38,6 +38,7 @@ from tcmrl_data.store.sealing import is_complete
 from tcmrl_data.store.tables import read_sealed
 from tcmrl_data.store.task_table import TASKS, parse_tasks
 from tcmrl_data.verification.contents import content_problems, task_problems
+from tcmrl_data.verification.derivations import derivation_problems
 from tcmrl_data.verification.replay import Replay, replay_part, spread_parts
 from tcmrl_data.verification.scan import Scan, scan_dataset
 
@@ -96,6 +97,7 @@ def verify_dataset(
     *,
     level: VerifyLevel = "digests",
     replay: int = 0,
+    sources: Sequence[str | Path | Dataset] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> VerifyReport:
     """Checks every file of a dataset and reports the findings; changes nothing.
@@ -104,10 +106,12 @@ def verify_dataset(
         path: the dataset's folder or its `manifest.json`.
         level: the checks to make, see the module.
         replay: number of parts to make again from their snapshots and seeds, spread over the dataset.
+        sources: datasets that a derived dataset was made of; its derivation is done again and compared.
         progress: called with parts done and parts in all.
 
     Raises:
-        ManifestError: there is no dataset at the path.
+        ManifestError: there is no dataset at the path, or it is a view.
+        SelectionError: `sources` of a dataset that was not derived, or not all of them.
 
     Example:
         >>> verify_dataset("data/point-robot", level="deep").findings  # doctest: +SKIP
@@ -123,6 +127,7 @@ def verify_dataset(
     run = _Verification(folder, level, is_locked=False)
     parts = run.check(progress)
     replays = run.replay(replay)
+    run.derive_again(sources)
     sizes = [status.st_size for status in run.scan.files.values()]
     return VerifyReport(
         folder,
@@ -207,6 +212,12 @@ class _Verification:
             for problem in replay.problems:
                 self._add(part_file(key), f"replay: {problem}")
         return tuple(replays)
+
+    def derive_again(self, sources: Sequence[str | Path | Dataset]) -> None:
+        """Does the derivation again, if sources are given and the tables are sound, and compares."""
+        if sources and self.manifest is not None and not self.findings:
+            for file, problem in derivation_problems(Dataset(self.folder, self.manifest), sources):
+                self._add(file, f"derivation: {problem}")
 
     def _can_replay(self, key: PartKey) -> bool:
         run = self._run(key)
