@@ -31,9 +31,10 @@ from tcmrl_data.store.part_record import DATA_VERSION, STANDARD_ARRAYS, PartReco
 class DatasetRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
     """Records all episodes of an environment as one task of a new dataset, which exists after `close`.
 
-    Every `part_episodes` episodes become a part, whose step is the number of environment steps before it. Every finished episode is on disk before `step` returns. After a crash, a recorder with the same
-    arguments goes on behind the last finished episode: only the open one is lost. An episode that `reset`
-    ends early is marked as truncated. The policy and the seed are not known and stay open.
+    Every `part_episodes` episodes become a part, whose step is the number of environment steps before it.
+    Every finished episode is on disk before `step` returns. After a crash, a recorder with the same arguments
+    goes on behind the last finished episode: only the open one is lost. An episode that `reset` ends early is
+    marked as truncated. The policy and the seed are not known and stay open.
 
     `Recorder` is another thing: it collects lanes in memory, for rollouts.
 
