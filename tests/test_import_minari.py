@@ -1,5 +1,6 @@
 """Minari datasets: those that were exported here, and those that Minari's own collector wrote."""
 
+import warnings
 from pathlib import Path
 from typing import Any
 
