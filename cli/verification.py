@@ -32,8 +32,24 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path))
     metavar="N",
     help="Also regenerate N parts from their snapshots and seeds, and compare them.",
 )
+@click.option(
+    "--source",
+    "sources",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    metavar="DATASET",
+    help="A dataset that DATASET was derived from; name all, and the derivation is done again and compared.",
+)
 @output_options
-def verify(dataset: Path, as_json: bool, quiet: bool, quick: bool, deep: bool, replay: int) -> None:
+def verify(
+    dataset: Path,
+    as_json: bool,
+    quiet: bool,
+    quick: bool,
+    deep: bool,
+    replay: int,
+    sources: tuple[Path, ...],
+) -> None:
     """Check DATASET, and list every damaged, missing or foreign file.
 
     By default every file is hashed. A replay must be equal bit for bit if CPU model, packages and physics
@@ -44,6 +60,7 @@ def verify(dataset: Path, as_json: bool, quiet: bool, quick: bool, deep: bool, r
     Examples:
       tcmrl-data verify data/point-robot
       tcmrl-data verify data/point-robot --deep --replay 3 --json
+      tcmrl-data verify data/point-robot-medium --deep --source data/point-robot
     """
     import tcmrl_data
 
@@ -53,6 +70,7 @@ def verify(dataset: Path, as_json: bool, quiet: bool, quick: bool, deep: bool, r
             dataset,
             level=level,
             replay=replay,
+            sources=sources,
             progress=lambda done, total: progress.update("verify", done=done, total=total, unit="parts"),
         )
     if as_json:

@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -35,9 +34,6 @@ from tcmrl_data.store.part_table import PartEntry, PartTable
 from tcmrl_data.store.platform import Platform
 from tcmrl_data.store.sealing import write_dataset
 
-WRITERS = 4
-"""Parts that are copied side by side."""
-
 
 @dataclass(frozen=True)
 class Copied:
@@ -57,11 +53,6 @@ class Copied:
     def entry(self) -> PartEntry:
         """The part's line in its source."""
         return self.source.entry(self.source_key)
-
-    @property
-    def platform(self) -> Platform:
-        """The platform that it was made on."""
-        return self.source.manifest.platforms[self.entry.platform]
 
 
 def derivation_of(
@@ -142,10 +133,10 @@ class Assembly:
             StorageError: the operating system refuses an operation.
         """
         make_folders(self._out / STAGING)
-        with ThreadPoolExecutor(WRITERS) as pool:
-            for done, entry in enumerate(pool.map(self._copy, parts), start=1):
-                self._add(entry, parts[done - 1].platform)
-                progress(done, len(parts))
+        for done, part in enumerate(parts, start=1):
+            entry = self._copy(part)
+            self._add(entry, part.source.manifest.platforms[entry.platform])
+            progress(done, len(parts))
         self._copied += [self._out / part_file(part.key) for part in parts]
 
     def write(self, key: PartKey, make: Callable[[], tuple[PartRecord, bytes]]) -> PartEntry:
@@ -217,12 +208,7 @@ class Assembly:
         """Copies a part unless it is there; returns its line."""
         target, entry = self._out / part_file(part.key), part.entry
         if not _holds(target, entry):
-            with part.source.open_part(part.source_key) as archive:
-                data = archive.content()
-            if sha256(data) != entry.sha256:
-                file = part.source.file_of(part.source_key)
-                raise StoreError(f"{file} does not have the recorded sha256; run `tcmrl-data repair`")
-            place_file(target, data, staging=self._out / STAGING)
+            place_file(target, part.source.content(part.source_key), staging=self._out / STAGING)
         return entry._replace(run=part.key.run)
 
     def _add(self, entry: PartEntry, platform: Platform) -> PartEntry:

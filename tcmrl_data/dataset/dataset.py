@@ -16,6 +16,7 @@ from tcmrl_data.dataset.view import View, is_view_file, read_view
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.errors import (
     ManifestError,
     SelectionError,
@@ -24,7 +25,7 @@ from tcmrl_data.foundation.errors import (
     TaskError,
     TrajectoryError,
 )
-from tcmrl_data.foundation.plain_files import folder_problem
+from tcmrl_data.foundation.plain_files import folder_problem, one_line, read_plain_file
 from tcmrl_data.foundation.validation import first_problem
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
@@ -235,6 +236,23 @@ class Dataset:
     def file_of(self, key: PartKey) -> Path:
         """The file of a part's archive."""
         return self.folder / part_file(key)
+
+    def content(self, key: PartKey) -> bytes:
+        """The bytes of a part's archive, compared with the table.
+
+        Raises:
+            SelectionError: the dataset has no such part.
+            StoreError: the archive is missing, damaged, or reached through a link.
+        """
+        entry, file = self.entry(key), self.file_of(key)
+        problem = folder_problem(self.folder, part_folder(key))
+        try:
+            data = b"" if problem else read_plain_file(file, limit=entry.size)
+        except (OSError, ValueError) as error:
+            raise StoreError(f"{file}: {one_line(error)}; run `tcmrl-data repair`") from None
+        if sha256(data) != entry.sha256:
+            raise StoreError(f"{file} does not have the recorded sha256; run `tcmrl-data repair`")
+        return data
 
     def open_part(self, key: PartKey) -> Archive:
         """Opens a part's archive, to be closed by the caller.

@@ -147,22 +147,23 @@ def place_file(path: Path, data: bytes, *, staging: Path) -> None:
     Args:
         path: the file; missing parent folders are created.
         data: the content.
-        staging: folder for the unfinished file.
+        staging: folder for the unfinished file; it exists.
 
     Raises:
         StorageError: the operating system refuses an operation.
     """
     temporary = staging / f"{path.name}.{uuid.uuid4().hex}"
     with named_errors(path):
-        missing = [folder for folder in (path.parent, *path.parents, staging) if not folder.exists()]
-        for folder in sorted(missing):
-            with contextlib.suppress(FileExistsError):  # another thread may have created it meanwhile
-                disk.make_folder(folder)
+        for folder in [] if path.parent.exists() else reversed([path.parent, *path.parent.parents]):
+            if not folder.exists():
+                with contextlib.suppress(FileExistsError):  # another thread may have created it meanwhile
+                    disk.make_folder(folder)
         try:
             disk.write(temporary, data)
             disk.rename(temporary, path)
-        finally:
+        except OSError:
             temporary.unlink(missing_ok=True)
+            raise
 
 
 def sync_files(root: Path, files: Iterable[Path]) -> None:
@@ -172,7 +173,10 @@ def sync_files(root: Path, files: Iterable[Path]) -> None:
         StorageError: the operating system refuses an operation.
     """
     files = list(files)
-    folders = {folder for file in files for folder in file.parents if folder.is_relative_to(root)}
+    parents = {file.parent for file in files}
+    folders = {
+        place for folder in parents for place in (folder, *folder.parents) if root in (place, *place.parents)
+    }
     with named_errors(root), ThreadPoolExecutor(SYNCS) as pool:
         list(pool.map(disk.sync, files))
         list(pool.map(disk.sync, sorted(folders)))

@@ -12,6 +12,7 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, digest
 from tcmrl_data.foundation.errors import StoreError, TaskError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
+from tcmrl_data.foundation.records import hidden_text
 from tcmrl_data.foundation.validation import validate_table
 from tcmrl_data.interchange.readers.base import READERS, Reader, ReadPart, Say, say_nothing
 from tcmrl_data.interchange.readers.source_files import path_digest
@@ -117,6 +118,8 @@ def import_dataset(
         >>> report.environment  # doctest: +SKIP
         'foreign'
     """
+    if hidden_text([label, licence, url]) is not None:
+        raise StoreError("label, licence or url holds control characters; leave them out")
     kind = READERS.get(format_name)
     reader = kind(
         validate_table(kind.Options, options or {}, place=f"import of {format_name}", error=StoreError)
@@ -125,8 +128,11 @@ def import_dataset(
     digests = source.digests()
     notes: list[str] = []
     survey = Survey()
-    for part in source.parts(notes.append):
-        survey.add(part)
+    for path, part in source.parts(notes.append):
+        try:
+            survey.add(part)
+        except StoreError as error:
+            raise StoreError(f"{path}: {error}") from None
     known = {} if tasks is None else _tasks_of_file(Path(tasks))
     plan = _plan(survey, known, environment=environment, licence=licence)
     report = ImportReport(
@@ -186,8 +192,8 @@ class _Source:
             raise StoreError("no file is named; name at least one")
         return [path_digest(path, self.reader.files(path)) for path in self.paths]
 
-    def parts(self, say: Say = say_nothing) -> Iterator[ReadPart]:
-        """The parts of all paths."""
+    def parts(self, say: Say = say_nothing) -> Iterator[tuple[Path, ReadPart]]:
+        """The parts of all paths, with their paths."""
         for position, path in enumerate(self.paths):
             own: set[int] = set()
             for part in self.reader.read(path, say):
@@ -199,7 +205,7 @@ class _Source:
                     raise StoreError(
                         f"{path} holds several tasks, which have their numbers; leave --task out"
                     )
-                yield dataclasses.replace(part, task=index)
+                yield path, dataclasses.replace(part, task=index)
 
 
 def _plan(
@@ -256,7 +262,7 @@ def _publish(
 ) -> None:
     """Writes the parts that no earlier attempt has written."""
     tasks = {task.index: task for task in plan.tasks}
-    for done, part in enumerate(source.parts(), start=1):
+    for done, (_, part) in enumerate(source.parts(), start=1):
         assert part.task is not None
         task = tasks[part.task]
         assembly.write(PartKey(task.index, part.step), functools.partial(_make_part, plan, task, part))

@@ -9,6 +9,8 @@ import numpy as np
 
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.records import hidden_text
 from tcmrl_data.interchange.readers.base import ReadPart
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.limits import MAX_ARRAYS, MAX_INDEX
@@ -88,6 +90,10 @@ class Survey:
 
     def _add_task(self, part: ReadPart) -> None:
         assert part.task is not None
+        hidden = hidden_text(dict(part.about.parameters))
+        if hidden is not None:
+            place = printable(hidden)[:200]
+            raise StoreError(f"task {part.task}: parameters {place} hold control characters")
         task = Task(part.task, part.about.split or "train", dict(part.about.parameters))
         known = self.tasks.setdefault(part.task, task)
         if known != task:

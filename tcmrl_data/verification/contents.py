@@ -22,6 +22,7 @@ from tcmrl_data.store.limits import MAX_TASKS
 from tcmrl_data.store.part_files import POLICY
 from tcmrl_data.store.part_record import RECORD, STANDARD_ARRAYS, PartRecord
 from tcmrl_data.store.statistics import statistics
+from tcmrl_data.verification.derivations import origin_problem
 
 ContentProblem = tuple[str, str]
 """File or array within the part, and its problem."""
@@ -39,6 +40,9 @@ def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None
         recipe: what it was built from; None where that is not known.
     """
     environment = None if recipe is None else recipe_environment(recipe)
+    origin = origin_problem(record)
+    if origin is not None:
+        yield RECORD, origin
     yield from _policy_problems(archive, record, environment)
     arrays: dict[str, npt.NDArray[Any]] = {}
     for name, recorded in record.identity.arrays.items():

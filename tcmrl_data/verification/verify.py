@@ -6,12 +6,12 @@ parts out again. Beside a running build, a verification checks what the manifest
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.dataset.dataset import open_dataset
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.view import is_view_file
 from tcmrl_data.foundation.disk import LOCK, lock_holder
 from tcmrl_data.foundation.errors import ManifestError, StoreError
@@ -24,6 +24,7 @@ from tcmrl_data.store.part_record import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification.contents import task_problems
+from tcmrl_data.verification.derivations import derivation_problems
 from tcmrl_data.verification.description import Description
 from tcmrl_data.verification.findings import Finding, VerifyLevel, finding
 from tcmrl_data.verification.part_checks import PartChecks
@@ -57,6 +58,7 @@ def verify_dataset(
     *,
     level: VerifyLevel = "digests",
     replay: int = 0,
+    sources: Sequence[str | Path | Dataset] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> VerifyReport:
     """Checks every file of a dataset and reports the findings; changes nothing.
@@ -65,10 +67,12 @@ def verify_dataset(
         path: the dataset's folder or its `manifest.json`.
         level: the checks to make, see the module.
         replay: number of parts to make again from their snapshots and seeds, spread over the dataset.
+        sources: datasets that a derived dataset was made of; its derivation is done again and compared.
         progress: called with parts done and parts in all.
 
     Raises:
-        ManifestError: there is no dataset at the path.
+        ManifestError: there is no dataset at the path, or it is a view.
+        SelectionError: `sources` of a dataset that was not derived, or not all of them.
 
     Example:
         >>> verify_dataset("data/point-robot", level="deep").findings  # doctest: +SKIP
@@ -84,6 +88,7 @@ def verify_dataset(
     run = _Verification(folder, level, is_locked=False)
     parts = run.check(progress)
     replays = run.replay(replay)
+    run.derive_again(sources)
     sizes = [status.st_size for status in run.scan.files.values()]
     seconds = time.monotonic() - started
     return VerifyReport(folder, level, parts, len(sizes), sum(sizes), replays, run.sorted_findings(), seconds)
@@ -171,6 +176,13 @@ class _Verification:
             for problem in replay.problems:
                 self._add(part_file(key), f"replay: {problem}")
         return tuple(replays)
+
+    def derive_again(self, sources: Sequence[str | Path | Dataset]) -> None:
+        """Does the derivation again, if sources are given and the tables are sound, and compares."""
+        manifest = self._description.manifest
+        if sources and manifest is not None and not self.findings:
+            for file, problem in derivation_problems(Dataset(self._folder, manifest), sources):
+                self._add(file, f"derivation: {problem}")
 
     def _has_writer(self) -> bool:
         return not self._is_locked and lock_holder(self._folder / LOCK) is not None

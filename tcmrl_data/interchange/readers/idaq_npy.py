@@ -13,7 +13,6 @@ import re
 import stat
 from collections import defaultdict
 from collections.abc import Iterator, Sequence
-from io import BytesIO
 from math import prod
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, final
@@ -35,10 +34,13 @@ from tcmrl_data.interchange.readers.source_files import decoded_limit, require_o
 
 Policy = Literal["sample", "deterministic"]
 
-LARGEST_FILE = 2**26
+LARGEST_FILE = 2**22
 """Bytes of one episode's file; those that were published have at most a few hundred kilobytes."""
 
 COLUMNS = 4
+MAGIC = b"\x93NUMPY"
+LARGEST_HEADER = 2**10
+_HEADER = re.compile(rb"\{'descr': '\|O', 'fortran_order': False, 'shape': \((\d{1,9}), 4\), \} *\n")
 _TASK = re.compile(r"goal_idx([0-9]{1,9})")
 _EPISODE = re.compile(r"trj_eval(sample)?([0-9]{1,9})_step([0-9]{1,9})\.npy")
 
@@ -170,20 +172,19 @@ def _rows(data: bytes) -> list[Sequence[Any]]:
 
 def _header(data: bytes) -> tuple[tuple[int, ...], int]:
     """The shape that a file's header names, and where its content starts."""
-    stream = BytesIO(data)
-    version = np.lib.format.read_magic(stream)
-    if version not in ((1, 0), (2, 0)):
-        raise ValueError(f"has version {version} of .npy, 1.0 and 2.0 are read")
-    read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    try:
-        shape, is_fortran, dtype = read(stream)
-    except (SyntaxError, TypeError, RecursionError, MemoryError) as error:
-        raise ValueError(f"has no header of .npy ({one_line(error)})") from None
-    if dtype != np.dtype(object) or is_fortran:
-        raise ValueError(f"holds {dtype}, not objects: it has no rows [observation, action, reward, next]")
-    if len(shape) != 2 or shape[1] != COLUMNS or not 0 < prod(shape) <= len(data):
-        raise ValueError(f"says shape {repr(shape)[:80]}, rows of {COLUMNS} cells are expected")
-    return shape, stream.tell()
+    size = {b"\x01\x00": 2, b"\x02\x00": 4}.get(data[len(MAGIC) : len(MAGIC) + 2])
+    if not data.startswith(MAGIC) or size is None:
+        raise ValueError("is no .npy file of version 1.0 or 2.0")
+    first = len(MAGIC) + 2 + size
+    start = first + int.from_bytes(data[first - size : first], "little")
+    # a pattern, since NumPy's own reader would evaluate what stands here
+    match = _HEADER.fullmatch(data[first : min(start, first + LARGEST_HEADER)])
+    if match is None:
+        raise ValueError(f"is no object array of rows of {COLUMNS} cells [observation, action, reward, next]")
+    shape = (int(match[1]), COLUMNS)
+    if not 0 < prod(shape) <= len(data):
+        raise ValueError(f"says shape {shape}, for which it is too short")
+    return shape, start
 
 
 def _column(rows: Sequence[Sequence[Any]], column: int, file_bytes: int) -> npt.NDArray[Any]:

@@ -100,6 +100,8 @@ def _data_folder(path: Path) -> Path:
     resolved = path.resolve()
     for folder in (resolved / "data", resolved):
         if (folder / METADATA).is_file():
+            if folder.is_symlink():
+                raise StoreError(f"{folder} is a link, not a folder; replace it by a copy")
             return folder
     raise StoreError(f"{path}: holds no data/{METADATA}; name the folder of a Minari dataset")
 

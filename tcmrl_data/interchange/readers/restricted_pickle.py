@@ -161,12 +161,28 @@ _NAMES = {
 }
 
 
+MOST_OPERATIONS = 2**18
+"""Of a pickle; an episode of 500 steps takes 30,000. One of a single byte may take a hundred in memory."""
+
+
+def _counted(operation: Any) -> Any:
+    def run(unpickler: Any) -> None:
+        unpickler.left -= 1
+        if unpickler.left < 0:
+            raise PickleRefusedError(f"has more than {MOST_OPERATIONS} operations")
+        operation(unpickler)
+
+    return run
+
+
 class _Unpickler(pickle._Unpickler):
     """The interpreter written in Python: unlike the one in C, it allocates nothing on a pickle's word."""
 
     dispatch = {  # noqa: RUF012
-        operation[0]: pickle._Unpickler.dispatch[operation[0]] for operation in _OPERATIONS
+        operation[0]: _counted(pickle._Unpickler.dispatch[operation[0]]) for operation in _OPERATIONS
     }
+
+    left = MOST_OPERATIONS
 
     def find_class(self, module: str, name: str) -> Any:
         found = _NAMES.get((module, name))

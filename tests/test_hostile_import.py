@@ -1,0 +1,85 @@
+"""A hostile file cannot run code, lead elsewhere, block, take memory or publish anything."""
+
+import gc
+import os
+import resource
+import signal
+from pathlib import Path
+from types import FrameType
+
+import pytest
+
+from tcmrl_data import TcmrlError, import_dataset
+from tests.hostile_imports import CASES, FORMATS, Places, hdf5, minari
+from tests.made_up import trajectory
+from tests.test_import_idaq import saved
+
+MEMORY_FLOOR, MEMORY_RATIO = 64 * 2**20, 2
+ADDRESS_SPACE = 2**30
+SECONDS = 120
+
+
+@pytest.fixture
+def places(tmp_path: Path) -> Places:
+    (tmp_path / "outside").mkdir()
+    return Places(tmp_path / "source", tmp_path / "outside" / "secret", tmp_path / "ran")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _loaded(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The memory of imports is not counted."""
+    folder = tmp_path_factory.mktemp("sound")
+    places = Places(folder / "flat", folder / "secret", folder / "ran")
+    import_dataset("hdf5", [hdf5(lambda file, _: None, without="")(places)], folder / "one")
+    import_dataset(
+        "minari", [minari(lambda data, _: None)(Places(folder / "m", *places[1:]))], folder / "two"
+    )
+    saved(folder / "d/goal_idx0/trj_evalsample0_step0.npy", trajectory(5, seed=0))
+    import_dataset("idaq-npy", [folder / "d"], folder / "three")
+
+
+def ring(number: int, frame: FrameType | None) -> None:
+    raise AssertionError(f"blocked for {SECONDS} s")
+
+
+def resident_bytes(field: str) -> int:
+    line = next(line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(field))
+    return int(line.split()[1]) * 1024
+
+
+def source_bytes(folder: Path) -> int:
+    return sum(path.lstat().st_size for path in folder.rglob("*"))
+
+
+def test_the_corpus_is_large() -> None:
+    assert len(CASES) >= 40
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_hostile_file_is_refused(case: str, places: Places, tmp_path: Path) -> None:
+    path = CASES[case](places)
+    before = sorted(tmp_path.rglob("*"))
+    gc.collect()
+    Path("/proc/self/clear_refs").write_text("5")  # resets the peak of resident memory
+    resident = resident_bytes("VmRSS")
+    limits = resource.getrlimit(resource.RLIMIT_AS)
+    old = signal.signal(signal.SIGALRM, ring)
+    signal.alarm(SECONDS)
+    resource.setrlimit(resource.RLIMIT_AS, (resident_bytes("VmSize") + ADDRESS_SPACE, limits[1]))
+    try:
+        with pytest.raises(TcmrlError) as refused:
+            import_dataset(FORMATS[case.partition(":")[0]], [path], tmp_path / "out")
+    finally:
+        resource.setrlimit(resource.RLIMIT_AS, limits)
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, old)
+    grown = resident_bytes("VmHWM") - resident
+    message = str(refused.value)
+    assert str(places.folder) in message
+    assert len(message.splitlines()) == 1
+    assert message.isprintable()
+    assert len(message) < 800
+    assert grown <= MEMORY_FLOOR + MEMORY_RATIO * source_bytes(places.folder)
+    assert not places.marker.exists(), "code of the file ran"
+    assert sorted(tmp_path.rglob("*")) == before
+    assert not os.path.lexists(tmp_path / "out")
