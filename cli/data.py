@@ -10,6 +10,7 @@ from tcmrl_data.foundation.sizes import size
 from .building import build, plan
 from .cache import cache
 from .curation import delete, derive, merge, rename, split
+from .diff import diff
 from .frame import main_program, make_table, output_options, print_json, print_table, remark
 from .importing import import_data
 from .inspection import inspect
@@ -62,6 +63,7 @@ for _command in (
     split,
     rename,
     delete,
+    diff,
     extend,
 ):
     data.add_command(_command)
