@@ -17,7 +17,7 @@ from .inspection import inspect
 from .plugins import FORMAT
 from .progress import StageProgress
 from .recipes import recipe
-from .remaking import extend
+from .remaking import extend, relabel
 from .show import show
 from .status import status
 from .verification import gc, import_policy, repair, verify
@@ -65,6 +65,7 @@ for _command in (
     delete,
     diff,
     extend,
+    relabel,
 ):
     data.add_command(_command)
 

@@ -14,6 +14,8 @@ from .curation.derive import derive_dataset as derive_dataset
 from .curation.extend import ExtendReport as ExtendReport
 from .curation.extend import extend_dataset as extend_dataset
 from .curation.merge import merge_datasets as merge_datasets
+from .curation.relabel import RelabelReport as RelabelReport
+from .curation.relabel import relabel_dataset as relabel_dataset
 from .curation.rename import rename_dataset as rename_dataset
 from .curation.split import split_dataset as split_dataset
 from .dataset.dataset import Dataset as Dataset
