@@ -1,6 +1,9 @@
 """`relabel`: rewards of other tasks by simulating stored episodes again."""
 
+import copy
+import functools
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,17 +14,22 @@ import tcmrl_data
 from tcmrl_data import (
     BatchRequest,
     Dataset,
+    Trajectory,
     Transitions,
     derive_dataset,
+    extend_dataset,
+    merge_datasets,
     open_dataset,
     open_sampler,
     relabel_dataset,
     verify_dataset,
 )
+from tcmrl_data.curation.assembly import Copied, derivation_of, open_assembly
 from tcmrl_data.envs.controller import PlaybackController
 from tcmrl_data.foundation.errors import BuildError, SelectionError, SimulationError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.part_making import make_part
 from tests.commands import assert_refused, in_process
 
 REQUEST = BatchRequest(tasks=2, kinds={"policy": Transitions(4)})
@@ -113,7 +121,8 @@ def test_what_comes_from_a_test_task_is_not_trained_on(tiny: Dataset, tmp_path: 
         tiny, tmp_path / "out", to=[first, second], tasks=[test], snapshots="last", allow_test=True, workers=1
     )
     derive_dataset(tmp_path / "out", tmp_path / "less", episodes=3)
-    for folder in (tmp_path / "out", tmp_path / "less"):
+    merge_datasets([tiny.folder, tmp_path / "out"], tmp_path / "both")
+    for folder in (tmp_path / "out", tmp_path / "less", tmp_path / "both"):
         leaky = open_dataset(folder)
         assert leaky.manifest.derivation is not None
         with pytest.raises(SelectionError, match=f"was made from task {test}, which is no training task"):
@@ -140,6 +149,65 @@ def test_bad_input_writes_nothing(tiny: Dataset, tmp_path: Path) -> None:
     with pytest.raises(BuildError, match="run relabelled is relabelled"):
         relabel_dataset(tmp_path / "made", out, to=[first], of="relabelled")
     assert not out.exists()
+
+
+def forged(dataset: Dataset, out: Path, change: Callable[[Trajectory], Trajectory]) -> Path:
+    """A copy whose derived parts hold changed episodes under ids and digests that agree with them."""
+    with open_assembly(out, derivation_of("test", {}, [dataset]), [dataset]) as assembly:
+        for key in dataset.parts:
+            record = dataset.part(*key)
+            identity = record.identity
+            if identity.derived is None:
+                assembly.copy([Copied(key, dataset, key)])
+            else:
+                made = make_part(
+                    settings=identity.settings,
+                    task=dataset.task(key.task),
+                    step=key.step,
+                    seed=identity.seed,
+                    snapshot=dataset.snapshot(*key),
+                    trajectories=[change(episode) for episode in dataset.trajectories(*key)],
+                    references=record.references,
+                    platform=record.platform,
+                    derived=identity.derived,
+                )
+                assembly.write(key, functools.partial(copy.copy, made))
+        manifest = dataset.manifest
+        assembly.finish(
+            name=manifest.name, data_version=manifest.data_version, runs=manifest.runs, tasks=dataset.tasks
+        )
+    return out
+
+
+def test_a_deep_verification_finds_forged_parts(tiny: Dataset, tmp_path: Path) -> None:
+    first, second, *_ = (task.index for task in tiny.train_tasks)
+    relabel_dataset(tiny, tmp_path / "made", to=[first], tasks=[second], snapshots="last", workers=1)
+    extend_dataset(tiny.folder, out=tmp_path / "more", episodes=3, tasks=[first], workers=1)
+
+    def better(episode: Trajectory) -> Trajectory:
+        return replace(episode, rewards=episode.rewards + np.float32(0.5))
+
+    for name, run in (("made", "relabelled"), ("more", "extended")):
+        true = open_dataset(tmp_path / name)
+        assert verify_dataset(true.folder, level="deep").findings == ()
+        folder = forged(true, tmp_path / f"forged-{name}", better)
+        assert verify_dataset(folder).findings == ()
+        (finding,) = verify_dataset(folder, level="deep").findings
+        assert (finding.run, finding.task) == (run, first)
+        assert "made again: rewards differs in" in finding.problem
+
+
+def test_a_part_that_names_another_source_is_found(tiny: Dataset, tmp_path: Path) -> None:
+    first, second, *_ = (task.index for task in tiny.train_tasks)
+    extend_dataset(tiny.folder, out=tmp_path / "more", episodes=3, tasks=[first], workers=1)
+    more = open_dataset(tmp_path / "more")
+    record = more.part(first, 150, "extended")
+    assert record.identity.derived is not None
+    record.identity.derived["from"] = [tiny.entry(PartKey(second, 150)).id]
+    folder = forged(more, tmp_path / "forged", lambda episode: episode)
+    assert verify_dataset(folder).findings == ()
+    (finding,) = verify_dataset(folder, level="deep").findings
+    assert "which it names as its source" in finding.problem
 
 
 def test_playback_goes_on_with_zeros() -> None:

@@ -88,7 +88,10 @@ def replay_part(archive: Archive, record: PartRecord, key: PartKey, recipe: Reci
 
 
 def _check_cost(archive: Archive, record: PartRecord, recipe: Recipe) -> None:
-    """Refuses lane batches whose buffers the part's size does not justify."""
+    """Refuses lane batches and numbers of episodes that the part's size does not justify."""
+    stored = record.identity.arrays["episode_offsets"].shape[0] - 1
+    if stored != recipe.rollouts.episodes:
+        raise ValueError(f"{stored} episodes are stored, the recipe has {recipe.rollouts.episodes}")
     horizon, lanes = recipe.environment.horizon, recipe.rollouts.lanes
     shapes = record.identity.arrays
     columns = shapes["observations"].shape[1] + shapes["actions"].shape[1] + 2
