@@ -10,13 +10,14 @@ from tcmrl_data.foundation.sizes import size
 from .building import build, plan
 from .cache import cache
 from .curation import delete, derive, merge, rename, split
+from .diff import diff
 from .frame import main_program, make_table, output_options, print_json, print_table, remark
 from .importing import import_data
 from .inspection import inspect
 from .plugins import FORMAT
 from .progress import StageProgress
 from .recipes import recipe
-from .remaking import extend
+from .remaking import extend, relabel
 from .show import show
 from .status import status
 from .verification import gc, import_policy, repair, verify
@@ -62,7 +63,9 @@ for _command in (
     split,
     rename,
     delete,
+    diff,
     extend,
+    relabel,
 ):
     data.add_command(_command)
 

@@ -1,4 +1,4 @@
-"""`tcmrl-data extend`."""
+"""`tcmrl-data extend` and `relabel`."""
 
 import dataclasses
 from pathlib import Path
@@ -110,3 +110,85 @@ def extend(
     end = "would be made" if report.root is None else f"made, {report.present:,} already there"
     root = "" if report.root is None else f"; root {report.root[:12]}"
     click.echo(f"{printable(str(report.dataset))}: {parts} {end}, in runs {', '.join(report.runs)}{root}")
+
+
+@click.command()
+@DATASET
+@click.option(
+    "--to",
+    required=True,
+    metavar="TASKS",
+    help="Tasks whose rewards are wanted: indices such as 0-9,12, or all, or nearest:K.",
+)
+@click.option("--out", type=click.Path(path_type=Path), required=True, metavar="FOLDER", help="New dataset.")
+@click.option(
+    "--tasks", metavar="LIST", show_default="training tasks", help="Tasks whose episodes are taken."
+)
+@click.option(
+    "--snapshots",
+    default="all",
+    show_default=True,
+    metavar="RULE",
+    help="Parts to take: all, last, steps>=N, or return>=Q with a quantile Q.",
+)
+@click.option("--of", default="main", show_default=True, metavar="RUN", help="Run whose parts are taken.")
+@click.option("--run", default="relabelled", show_default=True, metavar="RUN", help="Name of the new run.")
+@click.option("--allow-test", is_flag=True, help="Take test tasks too; training refuses what comes of them.")
+@click.option("--label", help="The new dataset's own name.")
+@click.option("--workers", type=click.IntRange(min=1), show_default="all cores", help="Number of processes.")
+@click.option("--dry-run", is_flag=True, help="Check, count, and try one episode per task only.")
+@output_options
+def relabel(
+    dataset: Path,
+    to: str,
+    out: Path,
+    tasks: str | None,
+    snapshots: str,
+    of: str,
+    run: str,
+    allow_test: bool,
+    label: str | None,
+    workers: int | None,
+    dry_run: bool,
+    as_json: bool,
+    quiet: bool,
+) -> None:
+    """Make a dataset of the episodes of DATASET with the rewards of other tasks.
+
+    The episodes are simulated again in the other task. Their observations must come back bit for bit, so that
+    tasks which differ in more than rewards are refused.
+
+    \b
+    Examples:
+      tcmrl-data relabel data/half-cheetah-vel --to nearest:3 --out data/relabelled
+      tcmrl-data relabel data/point-robot --to all --tasks 0-4 --snapshots last --out data/relabelled
+    """
+    import tcmrl_data
+
+    limit = tcmrl_data.open_dataset(dataset).manifest.recipe.environment.tasks
+
+    def parse(text: str, option: str) -> list[int]:
+        return tcmrl_data.parse_indices(text, limit, option=option)
+
+    targets = to if to == "all" or to.startswith("nearest") else parse(to, "--to")
+    with stopped_by_signals(lambda: same_command(out)), StageProgress(quiet=quiet) as progress:
+        report = tcmrl_data.relabel_dataset(
+            dataset,
+            out,
+            to=targets,
+            tasks=None if tasks is None else parse(tasks, "--tasks"),
+            snapshots=snapshots,
+            of=of,
+            run=run,
+            allow_test=allow_test,
+            label=label,
+            workers=workers,
+            dry_run=dry_run,
+            progress=lambda done, total: progress.update("relabel", done=done, total=total, unit="parts"),
+        )
+    if as_json:
+        print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
+        return
+    counts = f"{report.parts:,} parts with {report.steps:,} steps of {report.pairs:,} pairs of tasks"
+    end = " would be made" if report.root is None else f"; root {report.root[:12]}"
+    click.echo(f"{printable(str(report.dataset))}: {counts} in {len(report.runs)} runs{end}")

@@ -24,7 +24,11 @@ DATASET = click.argument("dataset", type=click.Path(path_type=Path))
 @click.option(
     "--quick", is_flag=True, help="Check only names, sizes, links and the allow-list; hash no file."
 )
-@click.option("--deep", is_flag=True, help="Also decode every array and check its values.")
+@click.option(
+    "--deep",
+    is_flag=True,
+    help="Also decode every array, check its values, and simulate extended and relabelled parts again.",
+)
 @click.option(
     "--replay",
     type=click.IntRange(min=0),

@@ -14,10 +14,15 @@ from .curation.derive import derive_dataset as derive_dataset
 from .curation.extend import ExtendReport as ExtendReport
 from .curation.extend import extend_dataset as extend_dataset
 from .curation.merge import merge_datasets as merge_datasets
+from .curation.relabel import RelabelReport as RelabelReport
+from .curation.relabel import relabel_dataset as relabel_dataset
 from .curation.rename import rename_dataset as rename_dataset
 from .curation.split import split_dataset as split_dataset
 from .dataset.dataset import Dataset as Dataset
 from .dataset.dataset import open_dataset as open_dataset
+from .dataset.diff import DatasetDiff as DatasetDiff
+from .dataset.diff import DiffLevel as DiffLevel
+from .dataset.diff import diff_datasets as diff_datasets
 from .dataset.listing import list_datasets as list_datasets
 from .dataset.returns import return_table as return_table
 from .dataset.selection import Selection as Selection

@@ -245,6 +245,16 @@ def test_a_killed_extension_goes_on(tiny_copy: CopyTiny) -> None:
     assert verify_dataset(folder).findings == ()
 
 
+def test_repair_says_which_parts_it_does_not_make(tiny_copy: CopyTiny) -> None:
+    folder = tiny_copy()
+    extend_dataset(folder, episodes=3, tasks=[0], workers=1)
+    damaged = folder / "parts/extended/00000/0000150.zip"
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    report = tcmrl_data.repair_dataset(folder)
+    assert report.failed == ("1 parts of run extended were not built here; restore them from a copy",)
+    assert report.repaired == ()
+
+
 def test_command_line(tiny_copy: CopyTiny, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     call = in_process(data, capsys)
     folder = tiny_copy()

@@ -13,13 +13,13 @@ from tcmrl_data.curation.assembly import Copied, derivation_of, open_assembly
 from tcmrl_data.curation.extension import EXTEND, MAX_NOISE
 from tcmrl_data.curation.pairs import nearest_pairs, runs_of_pairs
 from tcmrl_data.curation.remaking import Job, RemakeSpec, remake_parts
+from tcmrl_data.curation.stored import check_parts, keys_of_run, simulated_run
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.disk import LOCK, lock_file, remove_abandoned
-from tcmrl_data.foundation.errors import BuildError, NondeterminismError, SelectionError, StoreError
+from tcmrl_data.foundation.errors import BuildError, StoreError
 from tcmrl_data.recipe.recipe import Rollouts
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.manifest import Run, read_manifest
-from tcmrl_data.store.platform import this_platform
 
 
 @dataclass(frozen=True)
@@ -99,12 +99,9 @@ def extend_dataset(
     """
     dataset = open_dataset(path)
     extension = _Extension(dataset, of, episodes, first_episode, noise, cross)
-    chosen = dataset.select(tasks=tasks, snapshots=snapshots)
-    jobs = extension.jobs(
-        [key for keys in chosen.parts.values() for key in keys if key.run == of],
-        run,
-    )
-    extension.check_sources(sorted({job.source for job in jobs}), allow_drift=allow_drift)
+    jobs = extension.jobs(keys_of_run(dataset, of, tasks, snapshots), run)
+    sources = sorted({job.source for job in jobs})
+    check_parts(dataset, extension.run, sources, policy=True, allow_drift=allow_drift)
     runs = extension.runs(jobs)
     new = [job for job in jobs if job.key not in dataset.parts]
     names = tuple(sorted({job.key.run for job in jobs}))
@@ -136,17 +133,9 @@ class _Extension:
     def __init__(
         self, dataset: Dataset, of: str, episodes: int, first_episode: int | None, noise: float, cross: int
     ) -> None:
-        known = {run.name: run for run in dataset.manifest.runs}
-        if of not in known:
-            raise SelectionError(f"{dataset.folder} has no run {of!r}; it has {', '.join(sorted(known))}")
-        run = known[of]
-        if run.recipe is None or run.seed is None or run.kind not in ("built", "extended"):
-            raise BuildError(
-                f"{dataset.folder}: run {of} is {run.kind}: it has no policies with keyed seeds; "
-                "extend one that was built"
-            )
-        lanes = run.recipe.rollouts.lanes
-        first = run.recipe.rollouts.episodes if first_episode is None else first_episode
+        run, recipe, seed = simulated_run(dataset, of)
+        lanes = recipe.rollouts.lanes
+        first = recipe.rollouts.episodes if first_episode is None else first_episode
         for name, value, least in (("--episodes", episodes, 1), ("--first-episode", first, 0)):
             if value < least or value % lanes:
                 raise BuildError(
@@ -157,8 +146,8 @@ class _Extension:
             raise BuildError(f"--noise {noise} is not in [0, {MAX_NOISE:g}]")
         if cross < 0:
             raise BuildError(f"--cross {cross} is negative; choose a number of tasks")
-        self._dataset, self._run, self._seed = dataset, run, run.seed
-        self._recipe = run.recipe.model_copy(update={"rollouts": Rollouts(episodes=episodes, lanes=lanes)})
+        self._dataset, self.run, self._seed = dataset, run, seed
+        self._recipe = recipe.model_copy(update={"rollouts": Rollouts(episodes=episodes, lanes=lanes)})
         self.settings: Mapping[str, Any] = {
             "operation": EXTEND,
             "of": of,
@@ -169,10 +158,6 @@ class _Extension:
 
     def jobs(self, keys: Sequence[PartKey], name: str) -> list[Job]:
         """The parts to make of policies."""
-        if not keys:
-            raise SelectionError(
-                f"{self._dataset.folder}: the selection holds no part of run {self._run.name}; choose others"
-            )
         sources = sorted({key.task for key in keys})
         cross = self.settings["cross"]
         pairs = [(task, task) for task in sources]
@@ -186,23 +171,6 @@ class _Extension:
             for key in keys
             if key.task == source
         ]
-
-    def check_sources(self, keys: Sequence[PartKey], *, allow_drift: bool) -> None:
-        """Refuses parts whose policies cannot act here as they did."""
-        manifest = self._dataset.manifest
-        here = this_platform(self._dataset.environment, self._recipe.behavior.source)
-        differences = [here.differences(platform) for platform in manifest.platforms]
-        for key in keys:
-            identity = self._dataset.part(*key).identity
-            file = self._dataset.file_of(key)
-            if identity.policy is None or identity.seed != self._seed:
-                raise BuildError(f"{file}: has no policy with the seed of run {key.run}; select other parts")
-            found = differences[self._dataset.entry(key).platform]
-            if found and not allow_drift:
-                raise NondeterminismError(
-                    f"{file}: was made on another platform ({'; '.join(found)[:200]}), where the same seeds "
-                    "give other episodes; extend it there, or say --allow-drift"
-                )
 
     def runs(self, jobs: Sequence[Job]) -> list[Run]:
         """The runs of the dataset with the new ones.

@@ -48,8 +48,16 @@ class _MergedRun:
 
     def takes(self, other: _SourceRun) -> bool:
         """Whether a run of a source is this one: made in the same way, and no key with another id."""
-        return other.definition == self.members[0].definition and all(
-            self.parts[key][2] == other.parts[key].id for key in self.parts.keys() & other.parts.keys()
+        return (
+            other.definition == self.members[0].definition
+            and all(
+                self.parts[key][2] == other.parts[key].id for key in self.parts.keys() & other.parts.keys()
+            )
+            and all(
+                member.run.source_of(task) == other.run.source_of(task)
+                for member in self.members
+                for task in {task for task, _ in member.parts} & {task for task, _ in other.parts}
+            )
         )
 
     def add(self, other: _SourceRun) -> None:
@@ -64,7 +72,8 @@ class _MergedRun:
             key=lambda run: canonical_json(run.model_dump(mode="json")),
         )
         steps = runs[0].steps if len({run.steps for run in runs}) == 1 else None
-        return runs[0].model_copy(update={"name": name, "steps": steps})
+        sources = sorted({pair for run in runs for pair in run.sources})
+        return runs[0].model_copy(update={"name": name, "steps": steps, "sources": tuple(sources)})
 
 
 def plan_merge(

@@ -13,7 +13,7 @@ Pair = tuple[int, int]
 
 
 def nearest_pairs(tasks: Sequence[Task], chosen: Sequence[Task], number: int) -> list[Pair]:
-    """From every chosen task to the nearest tasks of its own split, all nearest ones first.
+    """From every chosen task to the nearest other tasks of its split, all nearest ones first.
 
     Tasks are compared by the Euclidean distance of their parameters, each in units of its standard deviation
     over all tasks; of tasks at equal distances the one with the smaller index is nearer.

@@ -5,16 +5,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.build.part import check_finite
 from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.build.published import Published, read_published
 from tcmrl_data.curation.derived import derived_fields
-from tcmrl_data.curation.extension import EXTEND, Extension, extended_episodes
+from tcmrl_data.curation.extension import Extension, extended_episodes
+from tcmrl_data.curation.relabelling import RELABEL, Relabelling, relabelled_episodes
 from tcmrl_data.curation.remaking import Job, RemakeSpec
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.base import Lanes
 from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
@@ -67,20 +70,16 @@ class _Maker:
         """Publishes the part of a job; a sound one that is there is read and left alone."""
         file = self._spec.out / part_file(job.key)
         source = self._dataset.part(*job.source)
-        settings = Extension(
-            task=job.source.task,
-            parameters=dict(self._dataset.task(job.source.task).parameters),
-            **self._spec.settings,
-        )
-        derived = derived_fields(EXTEND, [source.id], settings)
+        settings = self._settings(job)
+        derived = derived_fields(self._spec.operation, [source.id], settings)
         found = _read(file, job.key.run)
         if found is not None:
             published, record = found
             if not self._is_wanted(record.identity, source.identity.policy, derived):
                 raise StoreError(f"{file}: holds another part; delete it or choose another --run")
             return published
-        snapshot = self._dataset.snapshot(*job.source)
-        trajectories = extended_episodes(self._plan, snapshot, settings, self._open_lanes())
+        snapshot = None if source.identity.policy is None else self._dataset.snapshot(*job.source)
+        trajectories = self._episodes(job, snapshot, settings)
         check_finite(trajectories, f"{self._plan.environment.name}, {job.key}")
         record, data = make_part(
             settings=self._spec.recipe.unit_settings(),
@@ -96,6 +95,30 @@ class _Maker:
         )
         replace_file(file, data, staging=self._spec.out / STAGING)
         return Published.of_record(record, run=job.key.run, archive=data)
+
+    def _settings(self, job: Job) -> Extension | Relabelling:
+        """The settings of a job's part."""
+        if self._spec.operation == RELABEL:
+            return Relabelling(task=job.source.task, **self._spec.settings)
+        parameters = dict(self._dataset.task(job.source.task).parameters)
+        return Extension(task=job.source.task, parameters=parameters, **self._spec.settings)
+
+    def _episodes(
+        self, job: Job, snapshot: Snapshot | None, settings: Extension | Relabelling
+    ) -> list[Trajectory]:
+        """The episodes of a job's part."""
+        if isinstance(settings, Extension):
+            assert snapshot is not None  # the driver saw to it
+            return extended_episodes(self._plan, snapshot, settings, self._open_lanes())
+        return relabelled_episodes(
+            self._plan.environment,
+            self._dataset.trajectories(*job.source),
+            settings=settings,
+            step=job.source.step,
+            seed=self._spec.seed,
+            target=self._task,
+            lanes=self._open_lanes(),
+        )
 
     def _open_lanes(self) -> Lanes:
         if self._lanes is None:

@@ -14,7 +14,7 @@ from tcmrl_data.behavior.snapshot import Snapshot, read_snapshot
 from tcmrl_data.dataset.selection import Selection, chosen_parts
 from tcmrl_data.dataset.view import View, is_view_file, read_view
 from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Split, Task
+from tcmrl_data.envs.tasks import Split, Task, draw_tasks
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.errors import (
@@ -23,6 +23,7 @@ from tcmrl_data.foundation.errors import (
     SnapshotError,
     StoreError,
     TaskError,
+    TcmrlError,
     TrajectoryError,
 )
 from tcmrl_data.foundation.plain_files import folder_problem, one_line, read_plain_file
@@ -197,6 +198,15 @@ class Dataset:
             raise TaskError(f"{self.folder} holds no task {index}; build it with --tasks {index}")
         return task
 
+    def split_of(self, task: int) -> Split | None:
+        """The split of a task, also of one that the dataset holds no more; None where it is not known."""
+        held = self._tasks_by_index.get(task)
+        if held is not None:
+            return held.split
+        derivation = self.manifest.derivation
+        recorded = derivation.split_of_tasks() if derivation else {}
+        return recorded.get(task) or self._drawn_splits.get(task)
+
     def snapshots(self, task: int, run: str = MAIN_RUN) -> list[int]:
         """Snapshot steps of a task in a run, ascending."""
         return [key.step for key in self.parts.keys_of(task) if key.run == run]
@@ -332,6 +342,7 @@ class Dataset:
         tasks: Sequence[int] | None = None,
         snapshots: str = "all",
         tier: str | None = None,
+        allow_test: bool = False,
     ) -> Selection:
         """A view of some tasks and snapshots.
 
@@ -341,6 +352,7 @@ class Dataset:
             snapshots: `all`, `last`, `steps>=N`, `return>=Q`: of each task, the parts whose mean
                 return reaches the quantile Q in [0, 1] of the task's parts; or `tier:NAME`.
             tier: a quality tier, such as `medium`; the same as the rule `tier:medium`. `tiers.py` names them.
+            allow_test: let training use parts that were made from test tasks.
 
         Raises:
             SelectionError: the rule cannot be read, or nothing is left of a task.
@@ -357,9 +369,8 @@ class Dataset:
             raise SelectionError(
                 f"{self.folder}: no {split or 'such'} tasks in the dataset; build some with --tasks"
             )
-        return Selection(
-            self, tuple(chosen), {task.index: chosen_parts(self, task.index, rule) for task in chosen}
-        )
+        parts = {task.index: chosen_parts(self, task.index, rule) for task in chosen}
+        return Selection(self, tuple(chosen), parts, allow_test)
 
     def _read_record(self, key: PartKey) -> PartRecord:
         with self.open_part(key) as archive:
@@ -374,3 +385,11 @@ class Dataset:
     @functools.cached_property
     def _tasks_by_index(self) -> dict[int, Task]:
         return {task.index: task for task in self.tasks}
+
+    @functools.cached_property
+    def _drawn_splits(self) -> dict[int, Split]:
+        """Splits of all tasks as the recipe draws them; none where the environment cannot be made."""
+        try:
+            return {task.index: task.split for task in draw_tasks(self.environment)}
+        except TcmrlError:
+            return {}

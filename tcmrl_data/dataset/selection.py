@@ -63,12 +63,25 @@ class Selection:
         dataset: where it comes from.
         tasks: the selected tasks.
         parts: task index to the keys of its selected parts.
+        allow_test: training may use parts that were made from test tasks.
     """
 
     dataset: "Dataset"
     tasks: tuple[Task, ...]
     parts: dict[int, tuple[PartKey, ...]]
+    allow_test: bool = False
 
     def trajectories(self, task: int) -> list[Trajectory]:
         """All selected episodes of a task, snapshot by snapshot."""
         return [trajectory for key in self.parts[task] for trajectory in self.dataset.trajectories(*key)]
+
+    def parts_from_test(self) -> list[tuple[PartKey, int]]:
+        """Parts made from the policy or the episodes of another task that is not for training, and it."""
+        runs = {run.name: dict(run.sources) for run in self.dataset.manifest.runs}
+        return [
+            (key, source)
+            for keys in self.parts.values()
+            for key in keys
+            if (source := runs[key.run].get(key.task)) is not None
+            and self.dataset.split_of(source) != "train"
+        ]

@@ -45,7 +45,8 @@ def open_sampler(
         say: called with a message if the cache is used.
 
     Raises:
-        SelectionError: the selection holds test tasks, fewer than two tasks, or too little data of a task.
+        SelectionError: the selection holds test tasks, parts made from them, fewer than two tasks, or too
+            little data of a task.
 
     Example:
         >>> request = BatchRequest(tasks=16, kinds={"context": Trajectories(2)})
@@ -56,6 +57,13 @@ def open_sampler(
     test = [task.index for task in selection.tasks if task.split == "test"]
     if test:
         raise SelectionError(f"test tasks {test} must not be trained on; select split='train'")
+    foreign = [] if selection.allow_test else selection.parts_from_test()
+    if foreign:
+        key, task = foreign[0]
+        raise SelectionError(
+            f"the part of {key} was made from task {task}, which is no training task; select other parts, or "
+            "allow_test=True if its data may be trained on"
+        )
     if len(selection.tasks) < 2:
         raise SelectionError(
             f"meta-training needs at least 2 training tasks, the selection has {len(selection.tasks)}"

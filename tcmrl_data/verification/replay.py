@@ -14,11 +14,12 @@ from tcmrl_data.build.part import roll_out_part
 from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.curation.derived import read_settings
 from tcmrl_data.curation.extension import EXTEND, Extension, extended_episodes
+from tcmrl_data.curation.relabelling import RELABEL, Relabelling, relabelled_episodes
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.arrays import pack, read_arrays
+from tcmrl_data.store.arrays import pack, read_arrays, unpack
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.layout import DECODED_FLOOR, DECODED_RATIO
 from tcmrl_data.store.part_record import PartRecord
@@ -87,7 +88,10 @@ def replay_part(archive: Archive, record: PartRecord, key: PartKey, recipe: Reci
 
 
 def _check_cost(archive: Archive, record: PartRecord, recipe: Recipe) -> None:
-    """Refuses lane batches whose buffers the part's size does not justify."""
+    """Refuses lane batches and numbers of episodes that the part's size does not justify."""
+    stored = record.identity.arrays["episode_offsets"].shape[0] - 1
+    if stored != recipe.rollouts.episodes:
+        raise ValueError(f"{stored} episodes are stored, the recipe has {recipe.rollouts.episodes}")
     horizon, lanes = recipe.environment.horizon, recipe.rollouts.lanes
     shapes = record.identity.arrays
     columns = shapes["observations"].shape[1] + shapes["actions"].shape[1] + 2
@@ -98,9 +102,22 @@ def _check_cost(archive: Archive, record: PartRecord, recipe: Recipe) -> None:
 def _make_again(archive: Archive, record: PartRecord, plan: BuildPlan) -> dict[str, npt.NDArray[Any]]:
     (task,) = plan.tasks
     derived, place = record.identity.derived, str(archive.path)
-    snapshot = read_snapshot(archive.read, record.identity.step, place=place)
     parameters = [task.parameters] * plan.recipe.rollouts.lanes
     with _one_thread(), contextlib.closing(plan.environment.lanes(parameters)) as lanes:
+        if derived is not None and derived.get("operation") == RELABEL:
+            settings = read_settings(Relabelling, derived, place)
+            return pack(
+                relabelled_episodes(
+                    plan.environment,
+                    unpack(read_arrays(archive, record.identity.arrays)),
+                    settings=settings,
+                    step=record.identity.step,
+                    seed=plan.seed,
+                    target=task,
+                    lanes=lanes,
+                )
+            )
+        snapshot = read_snapshot(archive.read, record.identity.step, place=place)
         if derived is None:
             return pack(roll_out_part(plan, task=task, snapshot=snapshot, lanes=lanes))
         if derived.get("operation") == EXTEND:

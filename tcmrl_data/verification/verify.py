@@ -1,8 +1,9 @@
 """Verification of a dataset; damage is reported as findings and not raised.
 
 `quick` checks names, sizes and kinds of files; `digests` also hashes every archive and checks its directory
-and its record; `deep` also decodes every array and checks its content (`contents.py`); `replay.py` rolls
-parts out again. Beside a running build, a verification checks what the manifest named when it began.
+and its record; `deep` also decodes every array, checks its content (`contents.py`), and makes extended and
+relabelled parts again on an equal platform (`redoing.py`); `replay.py` rolls parts out again. Beside a
+running build, a verification checks what the manifest named when it began.
 """
 
 import time
@@ -28,6 +29,7 @@ from tcmrl_data.verification.derivations import derivation_problems
 from tcmrl_data.verification.description import Description
 from tcmrl_data.verification.findings import Finding, VerifyLevel, finding
 from tcmrl_data.verification.part_checks import PartChecks
+from tcmrl_data.verification.redoing import derived_problems
 from tcmrl_data.verification.replay import Replay, replay_part, spread_parts
 from tcmrl_data.verification.scan import scan_dataset
 
@@ -150,6 +152,11 @@ class _Verification:
             splits = manifest.derivation.split_of_tasks() if manifest.derivation else {}
             for problem in task_problems(self._description.tasks, manifest.recipe, splits):
                 self._add(TASKS, problem)
+        if self._level == "deep" and manifest is not None:
+            bad = {found.file for found in self.findings}
+            table, runs = self._description.table, {run.name: run for run in manifest.runs}
+            for file, problem in derived_problems(self._folder, table, runs, bad=bad):
+                self._add(file, problem)
         self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *entries, *unnamed})
         return len(entries)
 

@@ -1,0 +1,226 @@
+"""Episodes of one task with the rewards of another, where the two differ in rewards alone."""
+
+import contextlib
+import re
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from tcmrl_data.curation.assembly import check_out, derivation_of, open_assembly
+from tcmrl_data.curation.pairs import Pair, nearest_pairs, runs_of_pairs
+from tcmrl_data.curation.relabelling import RELABEL, Relabelling, relabelled_episodes
+from tcmrl_data.curation.remaking import Job, RemakeSpec, remake_parts
+from tcmrl_data.curation.stored import check_parts, first_episode_of, keys_of_run, simulated_run
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.foundation.errors import BuildError, SelectionError
+from tcmrl_data.store.keys import MAIN_RUN, PartKey
+from tcmrl_data.store.limits import MAX_RUNS
+from tcmrl_data.store.manifest import Run
+
+
+@dataclass(frozen=True)
+class RelabelReport:
+    """What a relabelling made, or would make.
+
+    Attributes:
+        dataset: the new dataset.
+        runs: its runs; each holds one source per task.
+        pairs: number of pairs of tasks.
+        parts: number of parts.
+        steps: number of steps.
+        root: of the dataset; None after `dry_run`.
+    """
+
+    dataset: Path
+    runs: tuple[str, ...]
+    pairs: int
+    parts: int
+    steps: int
+    root: str | None
+
+
+def relabel_dataset(
+    path: str | Path | Dataset,
+    out: str | Path,
+    *,
+    to: str | Sequence[int],
+    tasks: Sequence[int] | None = None,
+    snapshots: str = "all",
+    of: str = MAIN_RUN,
+    run: str = "relabelled",
+    allow_test: bool = False,
+    label: str | None = None,
+    workers: int | None = None,
+    dry_run: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> RelabelReport:
+    """Makes a dataset of stored episodes with the rewards that other tasks give for them.
+
+    Every episode is simulated again in the other task, from its stored seed and with its stored actions. Its
+    observations must come back bit for bit, so that tasks with other dynamics or other starts are refused. No
+    reward function has to be known. The same call goes on after a stop.
+
+    Args:
+        path: a dataset or a view.
+        out: folder of the new dataset, which holds relabelled parts alone; merge it with the old one for
+            both.
+        to: indices of the tasks whose rewards are wanted, `all`, or `nearest:K`: from every task to the K
+            nearest ones of its split, by parameters.
+        tasks: indices of the tasks whose episodes are taken; all training tasks where None.
+        snapshots: rule of `Dataset.select`.
+        of: run whose parts are taken.
+        run: name of the new run; what else comes to a task is in runs `<run>-2`, ….
+        allow_test: take test tasks too. Training refuses what comes from them, unless its selection allows
+            it.
+        label: the new dataset's own name.
+        workers: processes at the same time; one per core where None.
+        dry_run: only check, count, and try one part per task; write nothing.
+        progress: called with parts done and parts in all.
+
+    Raises:
+        SelectionError: a test task without `allow_test`, an unknown run, or nothing selected.
+        SimulationError: tasks differ in more than rewards; names the first step.
+        BuildError: parts whose seeds are not known, more runs than a dataset may have, or a failed worker.
+        NondeterminismError: the parts were made on another platform.
+        StoreError: `out` holds something else, or a part is damaged.
+
+    Example:
+        >>> relabel_dataset("data/half-cheetah-vel", "data/x", to="nearest:3").pairs  # doctest: +SKIP
+        240
+    """
+    dataset = path if isinstance(path, Dataset) else open_dataset(path)
+    out = Path(out)
+    source_run, recipe, seed = simulated_run(dataset, of)
+    sources = _sources(dataset, tasks, allow_test)
+    pairs = _pairs(dataset, sources, to, allow_test)
+    keys = keys_of_run(dataset, of, [task.index for task in sources], snapshots)
+    names = runs_of_pairs(pairs, run)
+    jobs = [
+        Job(key, PartKey(target, key.step, names[source, target]))
+        for source, target in pairs
+        for key in keys
+        if key.task == source
+    ]
+    check_parts(dataset, source_run, sorted({job.source for job in jobs}), policy=False)
+    runs = [
+        Run(
+            name=name,
+            kind="relabelled",
+            seed=seed,
+            recipe=recipe,
+            origin={"operation": RELABEL, "of": of},
+            steps=None,
+            sources=tuple(
+                sorted((target, source) for (source, target), found in names.items() if found == name)
+            ),
+        )
+        for name in dict.fromkeys(names.values())
+    ]
+    if len(runs) > MAX_RUNS:
+        raise BuildError(f"{out} would have {len(runs)} runs, more than {MAX_RUNS}; choose fewer --to tasks")
+    settings = {
+        "to": to if isinstance(to, str) else sorted(set(to)),
+        "tasks": sorted(task.index for task in sources),
+        "snapshots": snapshots,
+        "of": of,
+        "run": run,
+        "allow_test": allow_test,
+    }
+    derivation = derivation_of(RELABEL, settings, [dataset])
+    check_out(out, derivation)
+    first_episode = first_episode_of(source_run.origin)
+    spec = RemakeSpec(
+        dataset.path.resolve(),
+        out.resolve(),
+        RELABEL,
+        {"first_episode": first_episode},
+        recipe,
+        seed,
+        tuple(jobs),
+    )
+    _try_out(dataset, spec)
+    steps = sum(dataset.entry(job.source).steps for job in jobs)
+    counts = (tuple(found.name for found in runs), len(pairs), len(jobs), steps)
+    if dry_run:
+        return RelabelReport(out, *counts, None)
+    targets = {job.key.task for job in jobs}
+    with open_assembly(out, derivation, [dataset]) as assembly:
+        for published in remake_parts(spec, workers=workers, progress=progress):
+            assembly.take(published)
+        manifest = assembly.finish(
+            name=dataset.name,
+            data_version=dataset.manifest.data_version,
+            runs=runs,
+            tasks=[task for task in dataset.tasks if task.index in targets],
+            label=label,
+        )
+    return RelabelReport(out, *counts, manifest.root)
+
+
+def _sources(dataset: Dataset, tasks: Sequence[int] | None, allow_test: bool) -> list[Task]:
+    """The tasks whose episodes are taken."""
+    if tasks is None:
+        chosen = dataset.tasks if allow_test else dataset.train_tasks
+    else:
+        chosen = tuple(dataset.task(index) for index in sorted(set(tasks)))
+    _refuse_test(chosen, allow_test)
+    return list(chosen)
+
+
+def _pairs(
+    dataset: Dataset, sources: Sequence[Task], to: str | Sequence[int], allow_test: bool
+) -> list[Pair]:
+    """Which task's episodes get which task's rewards."""
+    if isinstance(to, str):
+        match = re.fullmatch(r"all|nearest:([1-9][0-9]{0,4})", to)
+        if match is None:
+            raise SelectionError(f"to {to!r}: expected task indices, all, or nearest:K")
+        if match[1]:
+            return nearest_pairs(dataset.tasks, sources, int(match[1]))
+        targets = dataset.tasks if allow_test else dataset.train_tasks
+    else:
+        targets = tuple(dataset.task(index) for index in sorted(set(to)))
+    _refuse_test(targets, allow_test)
+    pairs = [
+        (source.index, target.index)
+        for source in sources
+        for target in targets
+        if source.index != target.index
+    ]
+    if not pairs:
+        raise SelectionError(
+            f"{dataset.path}: no task is left whose rewards would be new; choose other tasks"
+        )
+    return pairs
+
+
+def _refuse_test(tasks: Sequence[Task], allow_test: bool) -> None:
+    test = [task.index for task in tasks if task.split == "test"]
+    if test and not allow_test:
+        raise SelectionError(
+            f"task {test[0]} is a test task, whose data must not get among those of training tasks; leave it "
+            "out, or say --allow-test"
+        )
+
+
+def _try_out(dataset: Dataset, spec: RemakeSpec) -> None:
+    """Relabels the first episode that goes to every task, so that most refusals come before any work.
+
+    Raises:
+        SimulationError: tasks differ in more than rewards.
+    """
+    environment = dataset.environment
+    firsts = {job.key.task: job for job in reversed(spec.jobs)}
+    for index, job in sorted(firsts.items()):
+        target = dataset.task(index)
+        with contextlib.closing(environment.lanes([target.parameters])) as lanes:
+            relabelled_episodes(
+                environment,
+                dataset.trajectories(*job.source)[:1],
+                settings=Relabelling(task=job.source.task, **spec.settings),
+                step=job.source.step,
+                seed=spec.seed,
+                target=target,
+                lanes=lanes,
+            )

@@ -1,0 +1,261 @@
+"""Differences of two datasets, down to the cause of the first one."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import numpy.typing as npt
+
+from tcmrl_data.dataset.cause import Cause, first_cause
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.store.keys import PartKey
+
+DiffLevel = Literal["manifest", "statistics", "arrays"]
+CONFIDENCE = 0.95
+
+
+@dataclass(frozen=True)
+class Change:
+    """A value that differs; None where a side does not have it."""
+
+    name: str
+    left: Any
+    right: Any
+
+
+@dataclass(frozen=True)
+class ReturnsDiff:
+    """Mean returns of last snapshots over tasks.
+
+    Attributes:
+        left: mean over the tasks of the left dataset.
+        right: mean over the tasks of the right one.
+        difference: right minus left.
+        low: lower end of Welch's 95% interval of the difference; None with fewer than two tasks in a dataset.
+        high: upper end.
+    """
+
+    left: float
+    right: float
+    difference: float
+    low: float | None
+    high: float | None
+
+
+@dataclass(frozen=True)
+class ObservationsDiff:
+    """The observation column whose mean differs most.
+
+    Attributes:
+        column: its position.
+        left: its mean over all steps of the left dataset.
+        right: that of the right one.
+        shift: right minus left in standard deviations of the left dataset; None where these are zero.
+    """
+
+    column: int
+    left: float
+    right: float
+    shift: float | None
+
+
+@dataclass(frozen=True)
+class DatasetDiff:
+    """What differs between two datasets.
+
+    Attributes:
+        left: where the one lies.
+        right: where the other lies.
+        roots: of both.
+        recipe: keys of the recipes that differ; their training defaults do not count.
+        runs: runs that differ.
+        platforms: names of packages and of parts of platforms, with all values of each side.
+        tasks: tasks that one side lacks, or that have another split or other parameters.
+        equal: number of parts that both have.
+        different: keys of parts that are not equal.
+        left_only: keys that the right dataset lacks.
+        right_only: keys that the left dataset lacks.
+        returns: None where they are equal.
+        observations: None where they are equal, or were not compared.
+        first: why the first part that differs does; None if there is none, or it was not looked for.
+    """
+
+    left: Path
+    right: Path
+    roots: tuple[str, str]
+    recipe: tuple[Change, ...]
+    runs: tuple[Change, ...]
+    platforms: tuple[Change, ...]
+    tasks: tuple[Change, ...]
+    equal: int
+    different: tuple[PartKey, ...]
+    left_only: tuple[PartKey, ...]
+    right_only: tuple[PartKey, ...]
+    returns: ReturnsDiff | None
+    observations: ObservationsDiff | None
+    first: Cause | None
+
+    @property
+    def same_root(self) -> bool:
+        """Whether both hold the same parts."""
+        return self.roots[0] == self.roots[1]
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing differs at all; datasets of equal roots may differ in splits or platforms."""
+        return self.same_root and not (self.recipe or self.runs or self.platforms or self.tasks)
+
+
+def diff_datasets(
+    left: str | Path | Dataset, right: str | Path | Dataset, *, level: DiffLevel = "statistics"
+) -> DatasetDiff:
+    """Compares two datasets and names the cause of the first difference.
+
+    Args:
+        left: a dataset or a view.
+        right: another one, of the same environment or not.
+        level: `manifest` reads manifests and tables; `statistics` also the records of parts, with the moments
+            of observations; `arrays` also decodes the first part that differs, to find its first row.
+
+    Raises:
+        ManifestError: one of them cannot be read.
+        StoreError: a part that is compared is damaged.
+
+    Example:
+        >>> found = diff_datasets("data/point-robot", "data/point-robot")  # doctest: +SKIP
+        >>> found.is_empty  # doctest: +SKIP
+        True
+    """
+    if level not in ("manifest", "statistics", "arrays"):
+        raise SelectionError(f"level {level!r}: expected manifest, statistics or arrays")
+    first, second = (side if isinstance(side, Dataset) else open_dataset(side) for side in (left, right))
+    ids = [{entry.key: entry.id for entry in side.parts.entries()} for side in (first, second)]
+    both = sorted(ids[0].keys() & ids[1].keys())
+    different = tuple(key for key in both if ids[0][key] != ids[1][key])
+    same = first.manifest.root == second.manifest.root
+    reads_parts = level != "manifest" and not same
+    return DatasetDiff(
+        left=first.path,
+        right=second.path,
+        roots=(first.manifest.root, second.manifest.root),
+        recipe=tuple(_changes(_recipe(first), _recipe(second))),
+        runs=tuple(_changes(*map(_runs, (first, second)))),
+        platforms=tuple(_changes(*map(_platforms, (first, second)))),
+        tasks=tuple(_changes(*map(_tasks, (first, second)))),
+        equal=len(both) - len(different),
+        different=different,
+        left_only=tuple(sorted(ids[0].keys() - ids[1].keys())),
+        right_only=tuple(sorted(ids[1].keys() - ids[0].keys())),
+        returns=None if same else _returns(first, second),
+        observations=_observations(first, second) if reads_parts else None,
+        first=first_cause(first, second, different[0], decode=level == "arrays")
+        if different and reads_parts
+        else None,
+    )
+
+
+def _recipe(dataset: Dataset) -> dict[str, Any]:
+    recipe = dataset.manifest.recipe.unit_settings()
+    return dict(flat({**recipe, "profile": dataset.manifest.profile}))
+
+
+def flat(values: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested tables by their dotted names."""
+    if isinstance(values, Mapping) and values:
+        for key, value in values.items():
+            yield from flat(value, f"{place}.{key}" if place else str(key))
+    else:
+        yield place, values
+
+
+def _runs(dataset: Dataset) -> dict[str, Any]:
+    fields = ("kind", "seed", "origin", "steps")
+    return {
+        f"{run.name}.{name}": value
+        for run in dataset.manifest.runs
+        for name, value in run.model_dump(mode="json", include=set(fields)).items()
+        if value is not None
+    }
+
+
+def _platforms(dataset: Dataset) -> dict[str, Any]:
+    """All values of every package and of everything else that a platform consists of."""
+    found: dict[str, set[str]] = {}
+    for platform in dataset.manifest.platforms:
+        values = platform.model_dump(mode="json", exclude={"packages"}) | platform.packages
+        for name, value in flat(values):
+            found.setdefault(name, set()).add(str(value))
+    return {name: sorted(values) for name, values in found.items()}
+
+
+def _tasks(dataset: Dataset) -> dict[str, Any]:
+    return {
+        f"task {task.index}": {"split": task.split, "parameters": dict(task.parameters)}
+        for task in dataset.tasks
+    }
+
+
+def _changes(left: Mapping[str, Any], right: Mapping[str, Any]) -> Iterator[Change]:
+    """The names whose values differ; first those of the left side, in its order."""
+    for name in [*left, *(name for name in right if name not in left)]:
+        if left.get(name) != right.get(name):
+            yield Change(name, left.get(name), right.get(name))
+
+
+def _returns(left: Dataset, right: Dataset) -> ReturnsDiff | None:
+    """The returns of the last snapshots of the first runs, with Welch's interval over tasks."""
+    samples = [np.array(_last_means(side)) for side in (left, right)]
+    if not all(map(len, samples)):
+        return None
+    means = [float(sample.mean()) for sample in samples]
+    gap = means[1] - means[0]
+    low = high = None
+    if min(map(len, samples)) > 1:
+        from scipy import stats
+
+        found = stats.ttest_ind(samples[1], samples[0], equal_var=False).confidence_interval(CONFIDENCE)
+        ends = (float(found.low), float(found.high))
+        low, high = (gap, gap) if any(map(math.isnan, ends)) else ends  # no variance at all
+    return ReturnsDiff(means[0], means[1], gap, low, high) if gap or _differ(samples) else None
+
+
+def _differ(samples: Sequence[npt.NDArray[np.float64]]) -> bool:
+    return not np.array_equal(samples[0], samples[1])
+
+
+def _last_means(dataset: Dataset) -> list[float]:
+    """Mean return of the last snapshot of every task that has one in the first run."""
+    run = dataset.manifest.runs[0].name
+    last = {entry.task: entry.mean for entry in dataset.parts.entries() if entry.run == run}
+    return list(last.values())  # entries are sorted by step
+
+
+def _observations(left: Dataset, right: Dataset) -> ObservationsDiff | None:
+    found = [_moments(side) for side in (left, right)]
+    if found[0][0].shape != found[1][0].shape:
+        return None
+    (mean, spread), (other, _) = found
+    gaps = other - mean
+    if not gaps.any():
+        return None
+    shifts = np.divide(gaps, spread, out=np.zeros_like(gaps), where=spread > 0)
+    column = int(np.abs(shifts).argmax()) if shifts.any() else int(np.abs(gaps).argmax())
+    shift = float(shifts[column]) if spread[column] > 0 else None
+    return ObservationsDiff(column, float(mean[column]), float(other[column]), shift)
+
+
+def _moments(dataset: Dataset) -> tuple[npt.NDArray[np.float64], npt.NDArray[np.float64]]:
+    """Mean and standard deviation of every observation column, from the moments of all parts."""
+    found = [dataset.part(*key).statistics.moments["observations"] for key in dataset.parts]
+    count = sum(moments["count"] for moments in found)
+    mean = _total(moments["sum"] for moments in found) / count
+    square = _total(moments["sum_of_squares"] for moments in found) / count
+    return mean, np.sqrt(np.maximum(square - mean**2, 0.0))
+
+
+def _total(rows: Iterable[Sequence[float]]) -> npt.NDArray[np.float64]:
+    return np.array([math.fsum(column) for column in zip(*rows, strict=True)])
