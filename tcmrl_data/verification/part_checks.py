@@ -83,9 +83,7 @@ class PartChecks:
         """How a part's record differs from what the dataset says of it."""
         assert self._description.manifest is not None
         run, task = self._runs.get(entry.run), self._tasks.get(entry.task)
-        if (
-            TASKS in self._description.unreadable
-        ):  # a finding of its own; the part's word on its task has to do
+        if TASKS in self._description.unreadable:  # a finding of its own; the part tells its task
             task = Task(entry.task, "train", record.identity.parameters)
         if run is None or task is None or entry.platform >= len(self._description.manifest.platforms):
             yield "is of a task, a run or a platform that the dataset does not have"
