@@ -51,11 +51,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Skips tests that need a separate network; tests/test_namespace.py makes one and runs them."""
+    """Leaves out exhaustive cases, and tests that need a separate network: test_namespace.py runs these."""
+    left_out = set() if config.getoption("--sweep") == 1 else {"exhaustive"}
     if not has_only_loopback():
-        elsewhere = [item for item in items if item.get_closest_marker("loopback")]
-        items[:] = [item for item in items if item not in elsewhere]
-        config.hook.pytest_deselected(items=elsewhere)
+        left_out.add("loopback")
+    elsewhere = [item for item in items if any(map(item.get_closest_marker, left_out))]
+    items[:] = [item for item in items if item not in elsewhere]
+    config.hook.pytest_deselected(items=elsewhere)
 
 
 @pytest.fixture

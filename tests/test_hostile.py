@@ -217,7 +217,7 @@ REPAIRED = [
     "case",
     [
         pytest.param(
-            case, id=case.name.replace(" ", "-"), marks=() if position % 8 == 0 else pytest.mark.sweep
+            case, id=case.name.replace(" ", "-"), marks=() if position % 8 == 0 else pytest.mark.exhaustive
         )
         for position, case in enumerate(REPAIRED)
     ],

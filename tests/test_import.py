@@ -323,6 +323,7 @@ def test_an_import_goes_on_after_a_fault_at_any_operation(
         assert verify_dataset(out).findings == (), f"operation {at} of {len(recorder.log)}"
 
 
+@pytest.mark.exhaustive
 def test_an_import_survives_kills(exported: list[Path], tmp_path: Path, sweep: int) -> None:
     """Killed at random, again and again, an import ends as one that nobody killed."""
     root = import_dataset("hdf5", exported, tmp_path / "whole").root

@@ -19,8 +19,8 @@ from tests.commands import in_process
     [
         (263, 100),
         pytest.param(1_000, 100, marks=pytest.mark.sweep),
-        pytest.param(MAX_PARTS // 100, 100, marks=pytest.mark.sweep),
-        pytest.param(MAX_TASKS, MAX_PARTS // MAX_TASKS, marks=pytest.mark.sweep),
+        pytest.param(MAX_PARTS // 100, 100, marks=pytest.mark.exhaustive),
+        pytest.param(MAX_TASKS, MAX_PARTS // MAX_TASKS, marks=pytest.mark.exhaustive),
     ],
 )
 def test_what_is_written_is_read(

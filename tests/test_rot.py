@@ -61,7 +61,10 @@ def write(file: Path, data: bytes | None) -> None:
         file.write_bytes(data)
 
 
-@pytest.mark.parametrize("rounds", [9, pytest.param(89, marks=pytest.mark.sweep)])
+@pytest.mark.parametrize(
+    "rounds",
+    [9, pytest.param(30, marks=pytest.mark.sweep), pytest.param(89, marks=pytest.mark.exhaustive)],
+)
 def test_rot_is_named_and_repaired(
     sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rounds: int
 ) -> None:
