@@ -124,6 +124,8 @@ def test_stored_snapshots_reproduce_the_stored_actions(tiny: Dataset) -> None:
 def test_a_policy_with_other_action_bounds_is_not_imported(tmp_path: Path) -> None:
     """Stable-Baselines3 scales the actor's output to the bounds; those of Pendulum are -2 and 2."""
     SAC("MlpPolicy", "Pendulum-v1", device="cpu", buffer_size=10).save(tmp_path / "pendulum.zip")
-    with pytest.raises(SnapshotError, match=r"actions lie in \[-2.0, 2.0\], .* in \[-1, 1\]; .*RescaleAction"):
+    with pytest.raises(
+        SnapshotError, match=r"actions lie in \[-2.0, 2.0\], .* in \[-1, 1\]; .*RescaleAction"
+    ):
         import_sac(tmp_path / "pendulum.zip", tmp_path / "out", observation="stored")
     assert not (tmp_path / "out").exists()
