@@ -231,7 +231,9 @@ def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
     assert driver.returncode == 1
     assert worker_pids(engine.mark) == []
     assert staged(out) == []
-    assert {step for _, step in part_ids(out)} in ({0}, {0, 100})
+    published = {(int(file.parent.name), int(file.stem)) for file in (out / "parts").rglob("*.zip")}
+    assert {step for _, step in published} in ({0}, {0, 100})
+    assert part_ids(out).keys() <= published  # the last of them may not have been told to the driver
 
 
 def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(

@@ -83,7 +83,10 @@ def test_another_processor_is_told_and_not_refused(
     assert list((tmp_path / "data" / STAGING).iterdir()) == []
 
 
-def test_other_versions_are_refused_by_machine_and_version(plan: BuildPlan, tmp_path: Path) -> None:
+def test_other_versions_are_refused_by_machine_and_version(
+    plan: BuildPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # a checkout in the working directory would tell its own version
     old_tcmrl = Machine("a", other_version(tmp_path, "tcmrl"))
     old_numpy = Machine("b", other_version(tmp_path, "numpy"))
     with pytest.raises(BuildError) as error:

@@ -25,8 +25,8 @@ from tcmrl_data.build.plan import plan_build
 from tcmrl_data.engine.base import ATTEMPTS, Unit
 from tcmrl_data.engine.ray import RayEngine
 from tcmrl_data.foundation.errors import BuildError
-from tcmrl_data.store.manifest import read_manifest
 from tests.conftest import TASKS, TINY
+from tests.datasets import part_ids
 from tests.directed import Directions
 from tests.disks import small_disk
 from tests.workers import (
@@ -43,8 +43,7 @@ loopback = pytest.mark.loopback
 
 
 def ids(folder: Path, *tasks: int) -> dict[tuple[int, int], str]:
-    parts = read_manifest(folder).parts
-    return {(part.task, part.step): part.id for part in parts if part.task in (tasks or TASKS)}
+    return {key: part for key, part in part_ids(folder).items() if key[0] in (tasks or TASKS)}
 
 
 @pytest.fixture
