@@ -25,6 +25,8 @@ DIFFERENTIABLE: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
     "masked_mean": (lambda x: losses.masked_mean(x, MASK), (random(2, 3),)),
     "sparsity": (lambda x: losses.sparsity_loss(x, MASK), (random(2, 3),)),
     "literal_sparsity": (lambda x: losses.literal_sparsity_loss(x.square() + 0.1, MASK), (random(2, 3),)),
+    "centered_sparsity": (lambda x: losses.centered_sparsity_loss(x, MASK), (random(2, 3),)),
+    "entropy_sparsity": (lambda x: losses.entropy_sparsity_loss(x, MASK), (random(2, 3),)),
     "reverse_context": (
         lambda c, w: losses.reverse_context(c, w, MASK).square().sum(),
         (random(2, 3, 4), random(2, 3, seed=1)),
@@ -100,6 +102,59 @@ def test_literal_equation_6_is_one_with_zero_gradient_where_ours_has_one() -> No
     assert gradient.abs().max() < 1e-15
     (gradient,) = torch.autograd.grad(losses.sparsity_loss(scores, MASK), scores)
     assert gradient[MASK].min() > 0.01
+
+
+def test_centered_sparsity_takes_the_mean_of_the_real_scores_off() -> None:
+    # without their mean, log 3, the scores are log 9, 0, 0, -log 9; sigmoid: 9/10, 1/2, 1/2, 1/10
+    scores = torch.tensor([[math.log(27.0), math.log(3.0), math.log(3.0), -math.log(3.0), 99.0]])
+    mask = torch.tensor([[True, True, True, True, False]])
+    assert losses.centered_sparsity_loss(scores, mask).item() == pytest.approx(0.5)
+    # of log 27, 0, 0 without their mean, log 3: log 9, -log 3, -log 3; sigmoid: 9/10, 1/4, 1/4
+    scores, three = (
+        torch.tensor([[math.log(27.0), 0.0, 0.0, 99.0]]),
+        torch.tensor([[True, True, True, False]]),
+    )
+    assert losses.centered_sparsity_loss(scores, three).item() == pytest.approx(1.4 / 3)
+    equal = torch.full((1, 5), 7.0)
+    assert losses.centered_sparsity_loss(equal, mask).item() == pytest.approx(0.5)
+    told_apart = torch.tensor([[400.0, 0.0, 0.0, 0.0, 0.0]])
+    assert losses.centered_sparsity_loss(told_apart, mask).item() == pytest.approx(0.25)
+
+
+def test_entropy_sparsity_is_a_share_of_the_largest_entropy() -> None:
+    scores = torch.tensor([[math.log(2.0), 0.0, 0.0, 9.0], [3.0, 3.0, 3.0, 3.0], [1.0, 0.0, 0.0, 0.0]])
+    mask = torch.tensor([[True, True, True, False], [True] * 4, [True, False, False, False]])
+    # weights 1/2, 1/4, 1/4: entropy 3/2 log 2, of log 3; equal weights: 1; a lane of one transition: 0
+    expected = (1.5 * math.log(2.0) / math.log(3.0) + 1.0 + 0.0) / 3
+    assert losses.entropy_sparsity_loss(scores, mask).item() == pytest.approx(expected)
+
+
+def test_entropy_sparsity_of_one_hot_weights_is_zero_with_finite_gradient() -> None:
+    scores = torch.tensor([[900.0, 0.0, 0.0]], requires_grad=True)
+    loss = losses.entropy_sparsity_loss(scores, torch.tensor([[True, True, False]]))
+    (gradient,) = torch.autograd.grad(loss, scores)
+    assert loss.item() == 0.0
+    assert gradient.isfinite().all()
+
+
+@pytest.mark.parametrize("loss", [losses.centered_sparsity_loss, losses.entropy_sparsity_loss])
+def test_no_bias_lowers_centered_or_entropy_sparsity(loss: Callable[..., Tensor]) -> None:
+    scores = random(2, 3)
+    shifted = loss(scores - 30.0, MASK).item()
+    assert shifted == pytest.approx(loss(scores, MASK).item())
+    assert losses.sparsity_loss(scores - 30.0, MASK).item() < 1e-9  # the bias satisfies this one
+
+
+def test_reverse_context_is_nearly_the_mean_of_many_representations() -> None:
+    """c_neg = c_mean + (c_mean - c) / (T - 1), whatever the attention is."""
+    representations, mask = random(2, 80, 4).detach().tanh(), torch.ones(2, 80, dtype=torch.bool)
+    weights = torch.softmax(3.0 * random(2, 80, seed=1).detach(), dim=-1)
+    mean = representations.mean(dim=1)
+    context = torch.einsum("lt,ltd->ld", weights, representations)
+    reverse = losses.reverse_context(representations, weights, mask)
+    torch.testing.assert_close(reverse, mean + (mean - context) / 79)
+    literal = losses.reverse_context(representations, weights, mask, literal=True)
+    torch.testing.assert_close(literal, 79 * reverse)
 
 
 def test_reverse_context_weighs_by_one_minus_attention() -> None:

@@ -9,7 +9,9 @@ from torch import Tensor
 
 from tcmrl_algo.algorithms import tcmrl
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLosses
+from tcmrl_algo.losses import context as context_losses
 from tcmrl_algo.losses.context import task_contrastive_loss
+from tcmrl_algo.networks.perceptron import call_frozen
 from tcmrl_data import Batch, Steps
 from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, with_steps
 
@@ -79,8 +81,10 @@ def test_positive_loss_trains_encoder_extractor_and_estimator() -> None:
 
 @pytest.mark.parametrize("sparse", [False, True])
 def test_negative_loss_leaves_the_estimator_untouched(sparse: bool) -> None:
-    made = learner({"weights": ONLY | {"negative": 1.0}}, sparse=sparse)
-    losses_of(made).total.backward()  # type: ignore[no-untyped-call]
+    made = learner({"weights": ONLY | {"negative": 1.0}, "estimator_training": "positive"}, sparse=sparse)
+    found = losses_of(made)
+    assert terms_of(found) == {"negative"}
+    found.total.backward()  # type: ignore[no-untyped-call]
     for parameter in made.estimator.parameters():
         assert parameter.grad is None or not parameter.grad.any()
     for part in (made.encoder, made.extractor):
@@ -88,6 +92,43 @@ def test_negative_loss_leaves_the_estimator_untouched(sparse: bool) -> None:
             max(parameter.grad.abs().max() for parameter in part.parameters() if parameter.grad is not None)
             > 1e-7
         )
+
+
+def all_gradients(config: dict[str, Any], *, sparse: bool = False) -> dict[str, Tensor]:
+    """The gradient of every parameter of the context learner; zeros where there is none."""
+    made = learner(config, sparse=sparse)
+    losses_of(made).total.backward()  # type: ignore[no-untyped-call]
+    return {
+        name: torch.zeros_like(parameter) if parameter.grad is None else parameter.grad
+        for name, parameter in made.named_parameters()
+    }
+
+
+@pytest.mark.parametrize("sparse", [False, True])
+@pytest.mark.parametrize("others", [{}, {"sparsity": 0.3}], ids=["negative alone", "without positive"])
+def test_without_l_pos_the_estimator_learns_from_detached_contexts(
+    sparse: bool, others: dict[str, float]
+) -> None:
+    """It gets the gradient that L_pos gives it; encoder and extractor get that of the other losses alone."""
+    weights = ONLY | {"negative": 0.7} | others
+    made = learner({"weights": weights}, sparse=sparse)
+    assert terms_of(losses_of(made)) == {"negative", "estimator", *others}
+    found = all_gradients({"weights": weights}, sparse=sparse)
+    alone = all_gradients({"weights": weights, "estimator_training": "positive"}, sparse=sparse)
+    by_positive = all_gradients({"weights": ONLY | {"positive": 1.0}}, sparse=sparse)
+    assert any(name.startswith("estimator.") for name in found)
+    for name, gradient in found.items():
+        expected = by_positive[name] if name.startswith("estimator.") else alone[name]
+        torch.testing.assert_close(gradient, expected, msg=name)
+        assert gradient.any() or name == "similarity" or name.endswith("bias"), name
+
+
+def test_the_estimator_is_not_trained_where_nothing_reads_it() -> None:
+    for config in (
+        {"weights": ONLY | {"sparsity": 1.0}},
+        {"weights": ONLY | {"negative": 1.0}, "extractor": "mean"},
+    ):
+        assert "estimator" not in terms_of(losses_of(learner(config)))
 
 
 def test_sparsity_and_contrastive_train_what_they_should() -> None:
@@ -164,6 +205,42 @@ def test_literal_equation_6_adds_nothing_to_any_gradient() -> None:
     assert max(grad.abs().max() for grad in grads) < 1e-7
 
 
+@pytest.mark.parametrize("kind", ["sigmoid", "centered", "entropy"])
+def test_only_the_sigmoid_sparsity_can_be_lowered_by_the_last_bias(kind: str) -> None:
+    """The bias shifts all scores alike, which the softmax does not see."""
+    made = learner({"sparsity": kind, "weights": ONLY | {"sparsity": 1.0}})
+    before = losses_of(made)
+    with torch.no_grad():
+        list(made.extractor.parameters())[-1].sub_(5.0)
+    after = losses_of(made)
+    torch.testing.assert_close(after.context, before.context)
+    unchanged = after.total.item() == pytest.approx(before.total.item(), rel=1e-4)
+    assert unchanged is (kind != "sigmoid")
+    if kind == "sigmoid":
+        assert after.total.item() < 0.1 * before.total.item()
+
+
+def test_negative_estimation_with_noise_of_mean_zero_fits_the_true_rewards() -> None:
+    """Over noise e and -e the gradient of L_neg is that of no noise, exactly, as is then its expectation."""
+
+    def gradient(sign: float) -> Tensor:
+        made = learner({"weights": ONLY | {"negative": 1.0}, "estimator_training": "positive"})
+        attention = made.attention(batch()["context"])
+        execution = made.encoder.read(batch()["execution"])
+        noise = sign * torch.randn(execution.rewards.shape, generator=torch.Generator().manual_seed(5))
+        wrong = context_losses.negative_rewards(execution.rewards, execution.mask, kind="random", noise=noise)
+        reverse = context_losses.reverse_context(attention.representations, attention.weights, attention.mask)
+        misled = call_frozen(made.estimator, execution.state_actions.flatten(1, 2), reverse)
+        loss = context_losses.negative_reward_loss(misled.view(execution.mask.shape), wrong, execution.mask)
+        loss.backward()  # type: ignore[no-untyped-call]
+        gradients = [value.grad for value in made.parameters() if value.grad is not None]
+        return torch.cat([value.flatten() for value in gradients])
+
+    positive, none, negative = gradient(1.0), gradient(0.0), gradient(-1.0)
+    torch.testing.assert_close((positive + negative) / 2, none, atol=1e-6, rtol=1e-4)
+    assert (positive - none).abs().max() > 0.01 * none.abs().max()
+
+
 def test_sampled_windows_replace_those_of_the_context() -> None:
     made = learner()
     plain = losses_of(made).metrics["loss/contrastive"].item()
@@ -183,11 +260,14 @@ def test_a_term_of_weight_zero_is_gone_and_the_others_stay(name: str) -> None:
     whole = losses_of(learner({"weights": TERM_WEIGHTS}))
     without = losses_of(learner({"weights": TERM_WEIGHTS | {name: 0.0}}))
     alone = losses_of(learner({"weights": ONLY | {name: TERM_WEIGHTS[name]}}))
-    assert terms_of(without) == set(TERM_WEIGHTS) - {name}
-    assert terms_of(alone) == {name}
+    replaced = {"estimator"} if name == "positive" else set()  # trains the estimator in its place
+    assert terms_of(without) == set(TERM_WEIGHTS) - {name} | replaced
+    assert terms_of(alone) == {name} | ({"estimator"} if name == "negative" else set())
     for key in without.metrics:
-        torch.testing.assert_close(without.metrics[key], whole.metrics[key], msg=key)
-    torch.testing.assert_close(without.total + alone.total, whole.total)
+        before = "loss/positive" if key == "loss/estimator" else key
+        torch.testing.assert_close(without.metrics[key], whole.metrics[before], msg=key)
+    added = sum(found.metrics.get("loss/estimator", torch.zeros(())) for found in (without, alone))
+    torch.testing.assert_close(without.total + alone.total - added, whole.total)
     torch.testing.assert_close(without.context, whole.context)
 
 
@@ -198,6 +278,9 @@ def test_a_term_of_weight_zero_is_gone_and_the_others_stay(name: str) -> None:
         ({"negative_reward": "min"}, {"loss/negative"}),
         ({"reverse_scale": "sum"}, {"loss/negative"}),
         ({"sparsity": "literal"}, {"loss/sparsity"}),
+        ({"sparsity": "centered"}, {"loss/sparsity"}),
+        ({"sparsity": "entropy"}, {"loss/sparsity"}),
+        ({"estimator_training": "positive"}, set()),
         ({"temperature": 2.0}, {"loss/contrastive"}),
         ({"reward_estimation": "trajectory"}, {"loss/positive", "loss/negative"}),
     ],

@@ -18,6 +18,16 @@ from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions, Windows
 
+SPARSITY = {
+    "sigmoid": losses.sparsity_loss,
+    "centered": losses.centered_sparsity_loss,
+    "entropy": losses.entropy_sparsity_loss,
+}
+"""Readings of Eq. 6 that are functions of the scores."""
+
+ESTIMATOR_WEIGHT = 1.0
+"""Of the term `estimator`, the only one that then trains the estimator; Adam is indifferent to its scale."""
+
 
 class Weights(BaseModel):
     """The `[training.tcmrl.weights]` table; a weight of 0 leaves the term out. The paper gives none of them.
@@ -54,10 +64,18 @@ class TcmrlConfig(MethodConfig):
             orthogonality and L_neg, which shape attention alone, are left out. The paper's variant without
             extractor (Figure 5) has no L_pos either: that is `mean` and a weight of 0 for `positive`.
         reward_estimation: of a `transition` (Eq. 7 and 8) or of a whole `trajectory` (Eq. 17 and 18); `auto`
-            goes by the environment's reward density (paper, F.3).
-        sparsity: `sigmoid` is our reading of Eq. 6; `literal` prints it, constant and without gradient.
-        reverse_scale: `mean` divides c_neg by T - 1 (ours), `sum` leaves it as printed.
-        negative_reward: how targets of L_neg are made wrong (paper, G.3: `random`).
+            goes by the environment's reward density (paper, F.3). An execution trajectory is one target of a
+            `trajectory` and T targets of a `transition`; `batch.execution_trajectories` makes up for it.
+        estimator_training: where the weight of `positive` is 0 and L_neg reads the estimator, `always` trains
+            the estimator all the same, on detached contexts (published code), and `positive` leaves it at its
+            random start (the paper's text: L_pos alone trains it).
+        sparsity: of Eq. 6. `sigmoid` is our reading; `centered` takes the mean score off first, so that no
+            bias satisfies it (ours); `entropy` is that of the weights (ours); `literal` is the printed form,
+            constant and without gradient.
+        reverse_scale: `mean` divides c_neg by T - 1 (ours), which brings it close to the mean context;
+            `sum` leaves it as printed (see `losses.context.reverse_context`).
+        negative_reward: how targets of L_neg are made wrong (paper, G.3: `random`). On average, `random`
+            targets are the true rewards (see `losses.context.negative_reward_loss`).
         negative_noise: standard deviation of `random`, in standard deviations of the reward
             (published code: 0.5, of the raw reward).
         temperature: of the contrastive loss (paper: none, 1).
@@ -70,7 +88,8 @@ class TcmrlConfig(MethodConfig):
     estimator_hidden: tuple[int, ...] = (256, 256)
     extractor: Literal["attention", "mean"] = "attention"
     reward_estimation: Literal["auto", "transition", "trajectory"] = "auto"
-    sparsity: Literal["sigmoid", "literal"] = "sigmoid"
+    estimator_training: Literal["always", "positive"] = "always"
+    sparsity: Literal["sigmoid", "centered", "entropy", "literal"] = "sigmoid"
     reverse_scale: Literal["mean", "sum"] = "mean"
     negative_reward: losses.NegativeKind = "random"
     negative_noise: float = Field(default=0.5, ge=0)
@@ -133,7 +152,7 @@ class TcmrlLearner(ContextLearner):
             terms["distance"] = self._distance_loss(torch.cat(representations[:2], dim=1), mask)
         total = attention.context.new_zeros(())
         for name, term in terms.items():
-            total = total + getattr(weights, name) * term
+            total = total + getattr(weights, name, ESTIMATOR_WEIGHT) * term
         metrics = {f"loss/{name}": term for name, term in terms.items()}
         metrics["context/largest_weight"] = attention.weights.amax(dim=-1).mean()
         metrics["context/spread"] = attention.context.std(dim=0).mean()
@@ -153,7 +172,8 @@ class TcmrlLearner(ContextLearner):
     ) -> Metrics:
         """Eq. 7 and 8, or 17 and 18; rewards in standard deviations, and returns divided by the horizon.
 
-        L_neg sees the estimator with its parameters held fixed (paper, end of section 4.1.1).
+        L_neg sees the estimator with its parameters held fixed (paper, end of section 4.1.1). Without
+        L_pos, the term `estimator` trains the estimator alone, for L_neg to read.
         """
         config, weights = self.config, self.config.weights
         whole, mask = self.estimates_trajectories, execution.mask
@@ -164,11 +184,15 @@ class TcmrlLearner(ContextLearner):
         else:
             inputs = execution.state_actions.flatten(1, 2)
         terms: Metrics = {}
+        has_negative = weights.negative > 0 and config.extractor == "attention"
+        positive = losses.positive_return_loss if whole else losses.positive_reward_loss
         if weights.positive:
             predicted = self.estimator(inputs, attention.context)
-            positive = losses.positive_return_loss if whole else losses.positive_reward_loss
             terms["positive"] = positive(predicted.view(shape), rewards, mask)
-        if weights.negative and config.extractor == "attention":
+        elif has_negative and config.estimator_training == "always":
+            predicted = self.estimator(inputs, attention.context.detach())
+            terms["estimator"] = positive(predicted.view(shape), rewards, mask)
+        if has_negative:
             scale = config.negative_noise / (self._horizon if whole else 1)
             noise = scale * torch.randn(rewards.shape, generator=generator).to(rewards.device)
             wrong = losses.negative_rewards(rewards, mask, kind=config.negative_reward, noise=noise)
@@ -192,7 +216,7 @@ class TcmrlLearner(ContextLearner):
             if self.config.sparsity == "literal":
                 terms["sparsity"] = losses.literal_sparsity_loss(attention.weights, attention.mask)
             else:
-                terms["sparsity"] = losses.sparsity_loss(attention.scores, attention.mask)
+                terms["sparsity"] = SPARSITY[self.config.sparsity](attention.scores, attention.mask)
         if weights.orthogonality:
             terms["orthogonality"] = losses.orthogonality_loss(attention.weights)
         return terms

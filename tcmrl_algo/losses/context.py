@@ -25,9 +25,35 @@ def sparsity_loss(scores: Float[Tensor, "lanes steps"], mask: Bool[Tensor, "lane
     """Our reading of Eq. 6: mean over transitions of sigmoid(score).
 
     Deviation: the printed form is constant (see `literal_sparsity_loss`). Scores before the softmax are
-    free to fall for all but the telling transitions.
+    free to fall for all but the telling transitions. They may also fall for all transitions together, which
+    lowers this loss and changes no weight; `centered_sparsity_loss` and `entropy_sparsity_loss` rule that
+    out.
     """
     return masked_mean(torch.sigmoid(scores), mask)
+
+
+def centered_sparsity_loss(scores: Float[Tensor, "lanes steps"], mask: Bool[Tensor, "lanes steps"]) -> Scalar:
+    """Our reading of Eq. 6 that no bias satisfies: mean over transitions of sigmoid(score - mean score).
+
+    The mean score is that of the lane's real transitions, so that a constant added to all scores changes this
+    loss as little as it changes the softmax. The value is 1/2 where all scores are equal, and tends to the
+    share of transitions above the mean, at best 1/T, as these are told apart from the others.
+    """
+    real = torch.where(mask, scores, 0.0)
+    means = real.sum(dim=-1, keepdim=True) / mask.sum(dim=-1, keepdim=True).clamp(min=1)
+    return sparsity_loss(real - means, mask)
+
+
+def entropy_sparsity_loss(scores: Float[Tensor, "lanes steps"], mask: Bool[Tensor, "lanes steps"]) -> Scalar:
+    """Sparsity of the softmax weights themselves: L = -sum_t w_t log(w_t) / log(T), averaged over lanes.
+
+    Not in the paper. w = softmax(score) over the lane's T real transitions (Eq. 4). The entropy is divided by
+    its maximum, so that the value lies in [0, 1] for every T; a lane of one transition counts as 0.
+    """
+    logarithms = torch.log_softmax(torch.where(mask, scores, -torch.inf), dim=-1)
+    logarithms = torch.where(mask, logarithms, 0.0)  # padding: 0 times minus infinity is NaN
+    entropies = -torch.where(mask, logarithms.exp() * logarithms, 0.0).sum(dim=-1)
+    return (entropies / mask.sum(dim=-1).clamp(min=2).log()).mean()
 
 
 def literal_sparsity_loss(weights: Float[Tensor, "lanes steps"], mask: Bool[Tensor, "lanes steps"]) -> Scalar:
@@ -46,6 +72,11 @@ def reverse_context(
     literal: bool = False,
 ) -> Float[Tensor, "lanes latent"]:
     """The context of what attention neglects: c_neg = sum_t (1 - w_t) c_t / (T - 1) (text above Eq. 8).
+
+    With the mean representation c_mean (Eq. 2) and the context c = sum_t w_t c_t (Eq. 5),
+    c_neg = (T c_mean - c) / (T - 1) = c_mean + (c_mean - c) / (T - 1): nearly the mean context for all but
+    the shortest lanes, whatever the attention is. Undivided, it points the same way and is T - 1 times
+    as long, which is outside of what the reward estimator sees of contexts in L_pos.
 
     Args:
         representations: c_t.
@@ -67,6 +98,8 @@ def negative_rewards(
     noise: Float[Tensor, "*lanes steps"],
 ) -> Float[Tensor, "*lanes steps"]:
     """Wrong targets for L_neg: r' + noise, or the trajectory's largest or smallest reward (Appendix G.3).
+
+    Noise of mean zero makes no target wrong on average (see `negative_reward_loss`); `max` and `min` do.
 
     Args:
         rewards: r'_t of execution trajectories.
@@ -99,6 +132,10 @@ def negative_reward_loss(
 
     `predicted` must come from an estimator whose parameters are held fixed: the paper keeps L_neg from
     training it (`networks.call_frozen` does that).
+
+    With r_neg = r' + e and noise e of mean zero and variance v that is independent of r_hat,
+    E (r_hat - r' - e)^2 = (r_hat - r')^2 + v: the expected loss is that of the true reward plus a constant,
+    and so the expected gradient trains c_neg, too, to predict the true reward. The noise adds variance alone.
     """
     return masked_mean((predicted - negative) ** 2, mask)
 

@@ -10,7 +10,9 @@ class BatchSettings(BaseModel):
         tasks: tasks per batch, drawn without replacement; all training tasks where there are fewer.
         transitions: transitions per task for the actor-critic.
         context_trajectories: context trajectories per task; one of these numbers is drawn for every batch.
-        execution_trajectories: execution trajectories per task, never among the context ones.
+        execution_trajectories: execution trajectories per task, never among the context ones. TCMRL
+            estimates rewards on them: 16 tasks with one trajectory of 20 steps are 320 targets per step for
+            Eq. 7 and 16 for Eq. 17, so that 20 trajectories give Eq. 17 as many (paper: not said).
         windows: windows of K steps per task, uniform over all valid windows; 0 for none.
         window_length: K.
     """
