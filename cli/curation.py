@@ -47,6 +47,11 @@ DRY_RUN = click.option("--dry-run", is_flag=True, help="Only say what would be m
 @click.option("--tasks", metavar="LIST", help="Only these tasks, such as 0-9,12.")
 @click.option("--split", type=click.Choice(["train", "test"]), help="Only tasks of this split.")
 @click.option(
+    "--held-out",
+    metavar="LIST",
+    help="Chosen tasks that become the test tasks; all others become training tasks.",
+)
+@click.option(
     "--episodes", metavar="N", help="Only the first N episodes of each part, or a share such as 50%."
 )
 @click.option("--seed", type=click.IntRange(min=0), help="Draw the episodes instead of taking the first.")
@@ -73,6 +78,7 @@ def derive(
     snapshots: str,
     tasks: str | None,
     split: str | None,
+    held_out: str | None,
     episodes: str | None,
     seed: int | None,
     min_return: float | None,
@@ -108,6 +114,7 @@ def derive(
             snapshots=snapshots,
             tasks=None if tasks is None else tcmrl_data.parse_indices(tasks, tcmrl_data.MAX_TASKS),
             split="train" if split == "train" else "test" if split else None,
+            held_out=() if held_out is None else _indices(held_out, "--held-out"),
             episodes=int(episodes) if episodes is not None and episodes.isdecimal() else episodes,
             seed=seed,
             min_return=min_return,
@@ -127,6 +134,12 @@ def derive(
     if made.far_from_medium:
         remark(f"warning: not near a score of 33: {describe_far(made.far_from_medium)}", quiet=quiet)
     _print([made], as_json=as_json, dry_run=dry_run)
+
+
+def _indices(text: str, option: str) -> list[int]:
+    from tcmrl_data import MAX_TASKS, parse_indices
+
+    return parse_indices(text, MAX_TASKS, option=option)
 
 
 @click.command()

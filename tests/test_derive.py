@@ -212,6 +212,36 @@ def test_damage_and_changes_of_the_source_are_found(graded: Dataset, tmp_path: P
     assert not (tmp_path / "changed" / MANIFEST).exists()
 
 
+@pytest.mark.parametrize("as_view", [False, True])
+def test_held_out_training_tasks_are_the_test_tasks_of_a_derived_dataset(
+    graded: Dataset, tmp_path: Path, as_view: bool, capsys: pytest.CaptureFixture[str]
+) -> None:
+    target = tmp_path / ("held.json" if as_view else "held")
+    arguments = ["derive", graded.folder, "--split", "train", "--held-out", "1", "--quiet"]
+    code, _, _ = in_process(data, capsys)(*arguments, "--view" if as_view else "--out", target)
+    made = open_dataset(target)
+    assert code == 0
+    assert [task.index for task in graded.test_tasks] == [3]
+    assert [task.index for task in made.train_tasks] == [0, 2]
+    assert [task.index for task in made.test_tasks] == [1]  # and task 3 is nowhere
+    assert {key.task for key in made.parts} == {0, 1, 2}
+    assert set(made.select(split="test").parts) == {1}
+    if not as_view:
+        assert verify_dataset(target, level="deep", sources=[graded]).findings == ()
+    again = derive_dataset(made, tmp_path / "again", tasks=[0, 1])
+    assert [task.split for task in open_dataset(again.out).tasks] == ["train", "test"]
+
+
+@pytest.mark.parametrize(
+    ("held_out", "problem"), [([1, 9], "does not choose task 9"), ([0, 1, 2], "leaves no training task")]
+)
+def test_impossible_held_out_tasks_are_refused(
+    graded: Dataset, tmp_path: Path, held_out: list[int], problem: str
+) -> None:
+    with pytest.raises(SelectionError, match=rf"held-out tasks .*{problem}; it has tasks \[0, 1, 2\]"):
+        derive_dataset(graded, tmp_path / "out", split="train", held_out=held_out)
+
+
 def test_a_view_opens_like_a_dataset_of_its_parts(graded: Dataset, tmp_path: Path) -> None:
     file = tmp_path / "views" / "medium.json"
     report = derive_dataset(graded, view=file, tier="medium", split="train", label="pr/medium")

@@ -57,6 +57,7 @@ def derive_dataset(
     snapshots: str = "all",
     tasks: Sequence[int] | None = None,
     split: Split | None = None,
+    held_out: Sequence[int] = (),
     episodes: int | str | None = None,
     seed: int | None = None,
     min_return: float | None = None,
@@ -80,6 +81,8 @@ def derive_dataset(
         snapshots: a rule of `Dataset.select`, instead of a tier.
         tasks: indices.
         split: only tasks of this split.
+        held_out: chosen tasks that become the test tasks, and all others the training tasks; such as some
+            training tasks on which settings are compared, while the test tasks are left out.
         episodes: of each part, a number or a share such as `50%`.
         seed: draws the episodes; None takes the first.
         min_return: only episodes whose undiscounted return reaches it; parts without one are left out.
@@ -109,7 +112,7 @@ def derive_dataset(
         raise SelectionError(f"snapshots {snapshots!r} and tier {tier!r} exclude each other; name one")
     rule = snapshots if tier is None else f"tier:{tier}"
     indices = None if tasks is None else tuple(tasks)
-    choice = Choice(rule, indices, split, episodes, seed, min_return, tuple(drop_arrays))
+    choice = Choice(rule, indices, split, episodes, seed, min_return, tuple(drop_arrays), tuple(held_out))
     plan = plan_subset(opened, choice, label=label)
     far = _far_from_medium(plan, rule, tolerance)
     if strict and far:

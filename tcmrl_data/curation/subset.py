@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from tcmrl_data.curation.cutting import SUBSET, Cut
 from tcmrl_data.curation.plan import Plan, PlannedPart, settle_runs
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.tiers import MEDIUM_SCORE, task_scores
-from tcmrl_data.envs.tasks import Split
+from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator
 from tcmrl_data.store.keys import PartKey
@@ -37,6 +37,8 @@ class Choice:
         seed: draws the episodes; None takes the first.
         min_return: only episodes whose undiscounted return reaches it.
         drop_arrays: extra arrays that are left out.
+        held_out: chosen tasks that become its test tasks, and all others its training tasks; empty leaves
+            splits as they are.
     """
 
     snapshots: str = "all"
@@ -46,6 +48,7 @@ class Choice:
     seed: int | None = None
     min_return: float | None = None
     drop_arrays: tuple[str, ...] = ()
+    held_out: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         _share(self.episodes)
@@ -55,9 +58,11 @@ class Choice:
             raise SelectionError(f"min_return {self.min_return} is no return")
 
     def to_json(self) -> dict[str, Any]:
-        """The choice as a derivation records it."""
+        """The choice as a derivation records it; without held-out tasks as it was before there were any."""
         tasks = None if self.tasks is None else sorted(set(self.tasks))
-        return vars(self) | {"tasks": tasks, "drop_arrays": sorted(set(self.drop_arrays))}
+        values = vars(self) | {"tasks": tasks, "drop_arrays": sorted(set(self.drop_arrays))}
+        del values["held_out"]
+        return values | ({"held_out": sorted(set(self.held_out))} if self.held_out else {})
 
     @classmethod
     def from_json(cls, settings: dict[str, Any]) -> "Choice":
@@ -66,11 +71,13 @@ class Choice:
         Raises:
             KeyError, TypeError, SelectionError: settings of another form.
         """
+        settings = {"held_out": (), **settings}
         values = {name: settings[name] for name in cls.__dataclass_fields__}
         tasks = values["tasks"]
         lists = {
             "tasks": None if tasks is None else tuple(tasks),
             "drop_arrays": tuple(values["drop_arrays"]),
+            "held_out": tuple(values["held_out"]),
         }
         return cls(**values | lists)
 
@@ -85,7 +92,8 @@ def plan_subset(source: Dataset, choice: Choice, *, label: str | None = None) ->
         StoreError: a part whose returns are needed is damaged.
     """
     selection = source.select(split=choice.split, tasks=choice.tasks, snapshots=choice.snapshots)
-    tasks = tuple(sorted(selection.tasks, key=lambda task: task.index))
+    tasks = _with_held_out(source, sorted(selection.tasks, key=lambda task: task.index), choice.held_out)
+    splits = {task.index: task.split for task in tasks} if choice.held_out else None
     parts: list[PlannedPart] = []
     for task in tasks:
         kept = [
@@ -108,10 +116,24 @@ def plan_subset(source: Dataset, choice: Choice, *, label: str | None = None) ->
         runs=settle_runs(source.manifest.runs, [part.key for part in parts], tasks, cut=cut_runs),
         tasks=tasks,
         parts=tuple(parts),
-        derivation=derivation_of(SUBSET, settings, [source]),
+        derivation=derivation_of(SUBSET, settings, [source], splits=splits),
         sources=(source,),
         label=label,
     )
+
+
+def _with_held_out(source: Dataset, tasks: Sequence[Task], held_out: Sequence[int]) -> tuple[Task, ...]:
+    """The tasks with the splits that held-out ones give them."""
+    if not held_out:
+        return tuple(tasks)
+    known = [task.index for task in tasks]
+    missing = sorted(set(held_out) - set(known))
+    if missing or not set(known) - set(held_out):
+        problem = f"does not choose task {missing[0]}" if missing else "leaves no training task"
+        raise SelectionError(
+            f"{source.path}: held-out tasks {list(held_out)}: the selection {problem}; it has tasks {known}"
+        )
+    return tuple(replace(task, split="test" if task.index in held_out else "train") for task in tasks)
 
 
 def _cut(source: Dataset, key: PartKey, choice: Choice) -> Cut | None:
