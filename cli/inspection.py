@@ -1,6 +1,7 @@
 """`tcmrl-data inspect`: returns, tasks, snapshots and episodes of a dataset."""
 
 import json
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,6 +11,9 @@ import click
 from .frame import fail_incomplete, make_table, number, output_options, print_json, print_table, remark
 
 Command = TypeVar("Command", bound=Callable[..., Any])
+
+SHIFTS_SHOWN = 8
+"""Parameters whose shift is printed; a walker has more than fifty."""
 
 
 class _Inspections(click.Group):
@@ -107,7 +111,10 @@ def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:
 @inspect.command()
 @dataset_command
 def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
-    """Print the tasks with split, parameters and reference returns.
+    """Print the tasks with split, parameters and reference returns, and how training and test tasks differ.
+
+    The second table has the mean of what orders the tasks, or of each numeric parameter, in training and test
+    tasks, and their difference, also in standard deviations of the training tasks.
 
     \b
     Example:
@@ -132,6 +139,29 @@ def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
         values = (number(known[reference]) for reference in references)
         table.add_row(str(row["task"]), row["split"], _shortened(row["parameters"]), *values)
     print_table(table)
+    _print_shift(document, quiet=quiet)
+
+
+def _print_shift(document: dict[str, Any], *, quiet: bool) -> None:
+    """Prints the shifts of at most SHIFTS_SHOWN parameters, the largest ones first."""
+    rows = sorted(document["shift"], key=_size, reverse=True)
+    if not rows:
+        return
+    columns = ["train", "test", "difference", "standardized"]
+    table = make_table(
+        f"{document['name']}: means of training and test tasks",
+        columns=["parameter", *columns],
+        text=["parameter"],
+    )
+    for row in rows[:SHIFTS_SHOWN]:
+        table.add_row(row["parameter"], *(number(row[column]) for column in columns))
+    print_table(table)
+    if len(rows) > SHIFTS_SHOWN:
+        remark(f"{len(rows) - SHIFTS_SHOWN} more parameters differ less; --json has all", quiet=quiet)
+
+
+def _size(row: dict[str, Any]) -> float:
+    return math.inf if row["standardized"] is None else abs(row["standardized"])
 
 
 @inspect.command()

@@ -170,8 +170,9 @@ def own_recipe(tmp_path: Path) -> Path:
 
 def test_a_recipe_file_gives_the_recipe_of_the_environment_that_it_names(own_recipe: Path) -> None:
     assert load_recipe(own_recipe, profile="quick") == load_recipe("point-robot", profile="quick")
-    own_recipe.write_text(own_recipe.read_text().replace('name = "point-robot"', 'name = "point-robot-wind"'))
-    assert load_recipe(own_recipe).make_environment().name == "point-robot-wind"
+    text = own_recipe.read_text()
+    own_recipe.write_text(text.replace('name = "point-robot"', 'name = "sparse-point-robot"'))
+    assert load_recipe(own_recipe).make_environment().name == "sparse-point-robot"
 
 
 def test_a_recipe_file_may_hold_variants_by_environment(own_recipe: Path) -> None:

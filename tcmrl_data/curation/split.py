@@ -10,7 +10,7 @@ from tcmrl_data.curation.derive import Derived, summary
 from tcmrl_data.curation.plan import Plan, PlannedPart, Progress, carry_out, no_progress, settle_runs
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.view import write_view
-from tcmrl_data.envs.tasks import Split
+from tcmrl_data.envs.tasks import Split, in_order
 from tcmrl_data.foundation.errors import ManifestError, SelectionError
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
 from tcmrl_data.store.manifest import read_manifest
@@ -32,8 +32,9 @@ def split_dataset(
 ) -> list[Derived]:
     """Makes several datasets of one: task folds, or disjoint episodes of every part.
 
-    Every task is a test task in one of the folds; all folds hold all parts, which keep ids and bytes. Of
-    `episodes=(45, 5)` the first dataset has the first 45 episodes of every part and the second the next 5.
+    Every task is a test task in one of the folds; all folds hold all parts, which keep ids and bytes. If the
+    recipe splits tasks by strata, the folds do too: each tests tasks that spread over the whole ordering.
+    Of `episodes=(45, 5)` the first dataset has the first 45 episodes of every part and the second the next 5.
 
     Args:
         source: a dataset or a view of one.
@@ -98,8 +99,7 @@ def plan_fold(source: Dataset, *, folds: int, seed: int, fold: int) -> Plan:
             f"{source.path}: {len(tasks)} tasks do not make {folds} folds; every fold needs a test task and "
             "two training tasks"
         )
-    order = keyed_generator(seed, source.name, NO_TASK, Purpose.FOLDS).permutation(len(tasks))
-    tested = {tasks[position].index for position in order[fold::folds]}
+    tested = _tested(source, folds=folds, seed=seed, fold=fold)
     splits: dict[int, Split] = {task.index: "test" if task.index in tested else "train" for task in tasks}
     settings = {"folds": folds, "seed": seed, "fold": fold}
     keys = tuple(source.parts)
@@ -113,6 +113,21 @@ def plan_fold(source: Dataset, *, folds: int, seed: int, fold: int) -> Plan:
         derivation=derivation_of(FOLD, settings, [source], splits=splits),
         sources=(source,),
     )
+
+
+def _tested(source: Dataset, *, folds: int, seed: int, fold: int) -> set[int]:
+    """Indices of the test tasks of a fold: folds are drawn as the recipe draws test tasks.
+
+    By strata, every `folds` neighbors along the environment's ordering go to different folds.
+    """
+    generator = keyed_generator(seed, source.name, NO_TASK, Purpose.FOLDS)
+    if source.manifest.recipe.environment.split == "strata":
+        order = [task.index for task in in_order(source.environment, source.tasks)]
+        strata = [order[start : start + folds] for start in range(0, len(order), folds)]
+        drawn = [(stratum, generator.permutation(folds).tolist()) for stratum in strata]
+        return {stratum[places[fold]] for stratum, places in drawn if places[fold] < len(stratum)}
+    permutation = generator.permutation(len(source.tasks))
+    return {source.tasks[position].index for position in permutation[fold::folds]}
 
 
 def plan_episodes(source: Dataset, *, first: int, number: int) -> Plan:

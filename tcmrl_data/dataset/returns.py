@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.shift import shift_rows
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.store.part_table import PartEntry
@@ -56,8 +57,12 @@ def return_table(dataset: Dataset, recompute: bool = False) -> dict[str, Any]:
 
 
 def task_table(dataset: Dataset) -> dict[str, Any]:
-    """Parameters and reference returns of every task; references are null while a task is incomplete."""
+    """Parameters and reference returns of every task, and how far test tasks lie from training tasks.
+
+    References are null while a task is incomplete; `shift` is explained by `ParameterShift`.
+    """
     return _heading(dataset) | {
+        "shift": shift_rows(dataset),
         "tasks": [
             {
                 "task": task.index,
@@ -68,7 +73,7 @@ def task_table(dataset: Dataset) -> dict[str, Any]:
                 else dataset.references(task.index).model_dump(),
             }
             for task in dataset.tasks
-        ]
+        ],
     }
 
 

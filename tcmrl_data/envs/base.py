@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
+from tcmrl_data.foundation.errors import RecipeError
 from tcmrl_data.foundation.plugins import Registry, unknown_name
 
 Parameters = Mapping[str, Any]
@@ -22,6 +23,9 @@ Parameters = Mapping[str, Any]
 
 Reward = Literal["stored", "dense"]
 """`stored`: the reward in the dataset. `dense`: the shaped reward, if the stored reward is sparse."""
+
+TaskSplit = Literal["permutation", "strata"]
+"""How test tasks are drawn; `EnvironmentSettings` explains both."""
 
 
 class EnvironmentSettings(BaseModel):
@@ -34,6 +38,9 @@ class EnvironmentSettings(BaseModel):
         train: number of training tasks.
         horizon: steps after which an episode is truncated.
         reward_density: `sparse` if few steps have a reward (paper, Appendix F.3).
+        split: how test tasks are drawn. `permutation`: any of all tasks. `strata`: the tasks, in the order of
+            `Environment.ordering`, are cut into as many strata as there are test tasks, and one task is drawn
+            of each, so that training and test tasks spread alike.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -44,6 +51,7 @@ class EnvironmentSettings(BaseModel):
     train: int = Field(ge=2)
     horizon: int = Field(ge=1)
     reward_density: Literal["dense", "sparse"] = "dense"
+    split: TaskSplit = "permutation"
 
     @model_validator(mode="after")
     def _some_test_tasks(self) -> "EnvironmentSettings":
@@ -107,10 +115,17 @@ class Environment(abc.ABC):
     action_dim: int
     extras: ClassVar[Mapping[str, type[np.generic]]] = {}
     """Dtypes of further per-step arrays, by name."""
+    ordering_name: ClassVar[str | None] = None
+    """What `ordering` measures, with its unit; None where tasks have no order."""
     simulator_bytes: ClassVar[int] = 0
     """Measured memory of one simulated task; 0 for tasks without a simulator."""
 
     def __init__(self, settings: EnvironmentSettings) -> None:
+        if settings.split == "strata" and self.ordering_name is None:
+            raise RecipeError(
+                f"environment.split is 'strata', but the tasks of {settings.name} have no order; "
+                "set it to 'permutation'"
+            )
         self.settings = settings
         self.name = settings.name
 
@@ -136,6 +151,14 @@ class Environment(abc.ABC):
         `draw_tasks` rounds floats to ten significant digits. Python's `math` is better than NumPy's functions
         of arrays, whose last digits depend on the processor's instruction set.
         """
+
+    def ordering(self, parameters: Parameters) -> float | None:
+        """The one number that orders the tasks, such as a goal's angle or a velocity.
+
+        None where several parameters define a task, or none of them has an order. A class that overrides this
+        method also sets `ordering_name`.
+        """
+        return None
 
     @abc.abstractmethod
     def make(
@@ -239,6 +262,7 @@ def make_environment(settings: Mapping[str, Any]) -> Environment:
 
     Raises:
         UnknownNameError: there is no such environment.
+        RecipeError: a split by strata of tasks that have no order.
         ValidationError: pydantic's, if the table is not valid.
     """
     kind = ENVIRONMENTS.get(settings["name"])

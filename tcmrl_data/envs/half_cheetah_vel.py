@@ -47,6 +47,7 @@ class HalfCheetahVel(Environment):
     Settings = HalfCheetahVelSettings
     observation_dim = 17
     action_dim = 6
+    ordering_name = "velocity (m/s)"
     simulator_bytes = 2 * 2**20
     settings: HalfCheetahVelSettings
 
@@ -54,6 +55,9 @@ class HalfCheetahVel(Environment):
         random = np.random.RandomState(task_seed)  # the published code's generator
         low, high = self.settings.min_velocity, self.settings.max_velocity
         return [{"velocity": float(velocity)} for velocity in random.uniform(low, high, num_tasks)]
+
+    def ordering(self, parameters: Parameters) -> float:
+        return float(parameters["velocity"])
 
     def make(
         self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"

@@ -63,9 +63,13 @@ class PointRobot(_PointRobot):
     """Goals evenly spaced on the half circle; dense reward -dist."""
 
     name = "point-robot"
+    ordering_name = "goal angle (rad)"
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         return half_circle_goals(num_tasks)
+
+    def ordering(self, parameters: Parameters) -> float:
+        return goal_angle(parameters)
 
 
 @final
@@ -73,9 +77,13 @@ class SparsePointRobot(_PointRobot):
     """Goals evenly spaced on the half circle; a reward only near the goal."""
 
     name = "sparse-point-robot"
+    ordering_name = "goal angle (rad)"
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         return half_circle_goals(num_tasks)
+
+    def ordering(self, parameters: Parameters) -> float:
+        return goal_angle(parameters)
 
     def rewards(self, distances: FloatArray, reward: Reward) -> FloatArray:
         if reward == "dense":
@@ -102,6 +110,12 @@ def half_circle_goals(num_tasks: int) -> list[dict[str, Any]]:
     """Goals (cos a, sin a) at angles linspace(0, pi, num_tasks), without wind."""
     angles = np.linspace(0.0, np.pi, num_tasks)
     return [{"goal": [math.cos(angle), math.sin(angle)], "wind": [0.0, 0.0]} for angle in angles]
+
+
+def goal_angle(parameters: Parameters) -> float:
+    """Angle of the goal in rad, 0 to pi on the half circle."""
+    x, y = parameters["goal"]
+    return math.atan2(y, x)
 
 
 def goals_and_winds(parameters: Sequence[Parameters]) -> tuple[FloatArray, FloatArray]:

@@ -1,8 +1,11 @@
 """Tasks of an environment: indices, parameters and the fixed split."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Literal
+
+import numpy as np
 
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
@@ -40,15 +43,37 @@ def draw_tasks(environment: Environment) -> tuple[Task, ...]:
     draws, so that they are the same bits on every instruction set.
     """
     settings = environment.settings
-    parameters = environment.draw_parameters(settings.tasks, settings.task_seed)
-    permutation = keyed_generator(settings.task_seed, environment.name, NO_TASK, Purpose.SPLIT).permutation(
-        settings.tasks
-    )
-    train = set(permutation[: settings.train].tolist())
-    return tuple(
-        Task(index, "train" if index in train else "test", _rounded(parameters[index]))
-        for index in range(settings.tasks)
-    )
+    drawn = environment.draw_parameters(settings.tasks, settings.task_seed)
+    tasks = [Task(index, "train", _rounded(parameters)) for index, parameters in enumerate(drawn)]
+    generator = keyed_generator(settings.task_seed, environment.name, NO_TASK, Purpose.SPLIT)
+    if settings.split == "strata":
+        order = [task.index for task in in_order(environment, tasks)]
+        test = draw_from_strata(order, settings.tasks - settings.train, generator)
+    else:
+        test = set(generator.permutation(settings.tasks)[settings.train :].tolist())
+    return tuple(replace(task, split="test") if task.index in test else task for task in tasks)
+
+
+def in_order(environment: Environment, tasks: Iterable[Task]) -> list[Task]:
+    """The tasks along the environment's ordering, or by index where it has none."""
+    return sorted(tasks, key=lambda task: (place_in_order(environment, task) or 0.0, task.index))
+
+
+def place_in_order(environment: Environment, task: Task) -> float | None:
+    """The task's place in the environment's ordering, if it has one and the task the parameters for it.
+
+    Tasks of imported data may lack parameters, or have others than the environment draws.
+    """
+    try:
+        return environment.ordering(task.parameters)
+    except (LookupError, TypeError, ValueError, OverflowError):
+        return None
+
+
+def draw_from_strata(order: Sequence[int], number: int, generator: np.random.Generator) -> set[int]:
+    """Draws one item of each of `number` strata, which are consecutive and differ in size by at most one."""
+    borders = [stratum * len(order) // number for stratum in range(number + 1)]
+    return {order[int(generator.integers(start, stop))] for start, stop in pairwise(borders)}
 
 
 def _rounded(value: Any) -> Any:

@@ -8,7 +8,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorSource
-from tcmrl_data.envs.base import ENVIRONMENTS, Environment, Reward, make_environment
+from tcmrl_data.envs.base import ENVIRONMENTS, Environment, Reward, TaskSplit, make_environment
 from tcmrl_data.envs.controller import View
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.errors import RecipeError, TcmrlError
@@ -63,8 +63,8 @@ class TaskChoice(_Table):
     """The `[build]` table: which tasks, and what a unit takes; no part of any digest.
 
     Attributes:
-        train_tasks: how many, evenly spaced; all where unset.
-        test_tasks: how many, evenly spaced; all where unset.
+        train_tasks: how many, evenly spaced along the environment's ordering; all where unset.
+        test_tasks: how many, as the training tasks; all where unset.
         cpus: cores that a cluster reserves for a unit, a task or a group of tasks.
         gpus: graphics processors that a cluster reserves for a unit; a fraction shares one.
         memory: bytes that a cluster reserves for a unit, where more than planned.
@@ -94,6 +94,7 @@ class EnvironmentTable(_Table):
     train: int
     horizon: int
     reward_density: Literal["dense", "sparse"]
+    split: TaskSplit = "permutation"
 
 
 class BehaviorTable(_Table):
@@ -179,12 +180,13 @@ def load_recipe(
     validated = functools.partial(validate_table, place=place, error=RecipeError)
     kind = ENVIRONMENTS.get(document.environment)
     named = tables["environment"] | {"name": document.environment}
-    environment = validated(kind.Settings, named, table="environment").model_dump(mode="json")
+    environment = validated(kind.Settings, named, table="environment")
+    kind(environment)  # refuses settings that the family as a whole does not allow
     training = {name: document.tables(name).get("training", {}) for name in document.profiles}
     return Recipe(
         profile=profile,
         about=validated(About, tables["about"], table="about"),
-        environment=EnvironmentTable.model_validate(environment),
+        environment=EnvironmentTable.model_validate(environment.model_dump(mode="json")),
         behavior=_behavior_table(tables["behavior"], place),
         rollouts=validated(Rollouts, tables["rollouts"], table="rollouts"),
         build=validated(TaskChoice, tables.get("build", {}), table="build"),

@@ -5,15 +5,16 @@ from itertools import groupby
 
 import numpy as np
 
-from tcmrl_data.envs.tasks import Task, draw_tasks
+from tcmrl_data.envs.tasks import Task, draw_tasks, in_order
 from tcmrl_data.foundation.errors import TaskError
-from tcmrl_data.recipe.recipe import Recipe, TaskChoice
+from tcmrl_data.recipe.recipe import Recipe
 
 
 def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]:
-    """Indices of `num_train` training and `num_test` test tasks, evenly spaced within their split.
+    """Indices of `num_train` training and `num_test` test tasks, evenly spaced within their split, ascending.
 
-    The first and the last task of a split are taken, so that a smaller selection spans the same range.
+    The tasks are given in the order along which to spread. The first and the last task of a split are taken,
+    so that a smaller selection spans the same range.
 
     Raises:
         TaskError: a split has fewer tasks than that.
@@ -29,22 +30,21 @@ def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]
 
 
 def choose_tasks(recipe: Recipe, indices: Sequence[int] | None = None) -> list[Task]:
-    """The named tasks of a recipe, or those that its profile chooses; errors as for `pick_tasks`."""
-    return pick_tasks(draw_tasks(recipe.make_environment()), recipe.build, indices)
+    """The named tasks of a recipe, or those that its profile chooses, ascending.
 
-
-def pick_tasks(tasks: Sequence[Task], choice: TaskChoice, indices: Sequence[int] | None = None) -> list[Task]:
-    """The named tasks of a task set, or those of a choice, ascending.
+    A profile's tasks are evenly spaced along the environment's ordering, or by index where it has none.
 
     Raises:
-        TaskError: an index outside the task set, or a choice of more tasks than there are.
+        TaskError: an index outside the task set, or a profile with more tasks than there are.
     """
+    environment = recipe.make_environment()
+    tasks = draw_tasks(environment)
     if indices is None:
         num_train, num_test = (
             sum(task.split == split for task in tasks) if wanted is None else wanted
-            for split, wanted in (("train", choice.train_tasks), ("test", choice.test_tasks))
+            for split, wanted in (("train", recipe.build.train_tasks), ("test", recipe.build.test_tasks))
         )
-        indices = spread(tasks, num_train=num_train, num_test=num_test)
+        indices = spread(in_order(environment, tasks), num_train=num_train, num_test=num_test)
     for index in indices:
         if not 0 <= index < len(tasks):
             raise TaskError(f"task index {index} does not exist, the tasks are 0-{len(tasks) - 1}")

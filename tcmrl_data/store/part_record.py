@@ -16,7 +16,7 @@ from tcmrl_data.store.platform import Platform
 PART_SCHEMA = 2
 """Raised when the meaning or the layout of a part's files changes; no part of the identity."""
 
-DATA_VERSION = 2
+DATA_VERSION = 3
 """Raised by hand when the code's data change for the same recipe and seed."""
 
 RECORD = "part.json"
