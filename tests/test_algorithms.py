@@ -12,13 +12,14 @@ import torch
 from tcmrl_cli.train import tcmrl
 from torch import Tensor
 
+from tcmrl_algo.context_methods.learner import ContextAlgorithm
 from tcmrl_algo.methods.base import METHODS, Algorithm, Method
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.methods.stages import StagePlan
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, Controller, Steps, Trajectory, Transition, UniformController
 from tests.commands import in_process
-from tests.made_up import ACTION_DIM, OBSERVATION_DIM, TASKS, batch_for, problem, settings, trajectory
+from tests.made_up import ACTION_DIM, OBSERVATION_DIM, TASKS, batch, batch_for, problem, settings, trajectory
 
 STEPS = 6
 """Of the whole training here: more than the doubles' first stages take, fewer than a second."""
@@ -148,6 +149,20 @@ def test_adaptation_changes_no_tensor_and_follows_every_lane_alone(name: str) ->
 
 
 @every
+def test_contexts_follow_the_order_of_tasks(name: str) -> None:
+    made = Made(name)
+    if not isinstance(made.algorithm, ContextAlgorithm):
+        return
+    made.train(1, STEPS)
+    steps, order = batch()["context"], [2, 0, 1]
+    fields = {field: getattr(steps, field) for field in steps.__dataclass_fields__}
+    turned = Steps(**{field: None if value is None else value[order] for field, value in fields.items()})
+    with torch.no_grad():
+        plain, found = (made.algorithm.learner.context(values) for values in (steps, turned))
+    torch.testing.assert_close(found, plain[order])
+
+
+@every
 def test_trajectories_matter_unless_the_method_is_blind(name: str) -> None:
     made = Made(name)
     made.train(1, STEPS)
@@ -199,9 +214,10 @@ def test_no_trajectory_is_a_context_where_the_method_needs_none(name: str) -> No
 @every
 def test_exploration_is_uniform_unless_the_method_says_otherwise(name: str) -> None:
     made = Made(name)
-    own = not isinstance(made.algorithm.explore([[], []]), UniformController)
+    collectors = [made.algorithm.explore(lanes) for lanes in ([[], []], LANES)]
+    own = not all(isinstance(collector, UniformController) for collector in collectors)
     assert own is made.method.capabilities.explores
-    assert act(made.algorithm.explore([[], []])).shape == (2, ACTION_DIM)
+    assert {act(collector).shape for collector in collectors} == {(2, ACTION_DIM)}
 
 
 @every

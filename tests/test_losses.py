@@ -206,6 +206,21 @@ def test_info_nce_of_two_tasks() -> None:
     assert losses.info_nce(queries, keys, both, temperature=2.0).item() == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("tasks", "temperature", "expected"), [(4, 1.0, 0.743668), (4, 0.1, 1.3619e-4), (16, 1.0, 1.874597)]
+)
+def test_info_nce_of_orthonormal_contexts_that_match(tasks: int, temperature: float, expected: float) -> None:
+    """log(1 + (N - 1) exp(-1 / tau))."""
+    contexts, mask = torch.eye(tasks, dtype=torch.float64), torch.ones(tasks, dtype=torch.bool)
+    loss = losses.info_nce(contexts, contexts, mask, temperature=temperature)
+    assert loss.item() == pytest.approx(expected, rel=1e-4)
+
+
+def test_info_nce_of_equal_contexts_is_the_log_of_their_number() -> None:
+    contexts, mask = torch.ones(16, 3, dtype=torch.float64), torch.ones(16, dtype=torch.bool)
+    assert losses.info_nce(contexts, contexts, mask).item() == pytest.approx(2.772589, rel=1e-6)
+
+
 def test_info_nce_knows_only_present_tasks() -> None:
     queries, keys = random(2, 3, 4).detach(), random(2, 3, 4, seed=1).detach()
     mask = torch.tensor([[True, True, False], [True, False, False]])  # at position 1, task 0 is alone

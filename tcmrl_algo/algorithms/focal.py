@@ -9,12 +9,13 @@ from torch import Tensor
 
 from tcmrl_algo.context_methods.encoding import ContextEncoder
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.context_methods.requests import trajectory_request
 from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions
+from tcmrl_data import Batch, BatchRequest, Steps
 
 
 class FocalConfig(MethodConfig):
@@ -70,15 +71,7 @@ class Focal(Method[FocalConfig]):
 
     def batch_request(self, settings: TrainingSettings, config: FocalConfig) -> BatchRequest:
         """The `[training.batch]` table without windows."""
-        batch = settings.batch
-        return BatchRequest(
-            batch.tasks,
-            {
-                "policy": Transitions(batch.transitions),
-                "context": Trajectories(batch.context_trajectories),
-                "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
-            },
-        )
+        return trajectory_request(settings)
 
     def create(self, problem: Problem, settings: TrainingSettings, config: FocalConfig) -> Algorithm:
         learner = FocalLearner(problem, config, generator=problem.generator(0))

@@ -32,9 +32,39 @@ class EncoderInputs:
         return self.inputs[..., : self.state_action]
 
     @property
+    def outcomes(self) -> Float[Tensor, "tasks trajectories steps outcomes"]:
+        """r_t and s_{t+1} - s_t."""
+        return self.inputs[..., self.state_action :]
+
+    @property
     def rewards(self) -> Float[Tensor, "tasks trajectories steps"]:
         """r_t."""
         return self.inputs[..., self.state_action]
+
+
+def transition_scaling(problem: Problem) -> Standardizer:
+    """Standardises s_t, a_t, r_t and s_{t+1} - s_t, side by side, by the moments of the data."""
+    parts = (
+        (problem.observation_mean, problem.observation_std),
+        (problem.action_mean, problem.action_std),
+        (torch.tensor([problem.reward_mean]), torch.tensor([problem.reward_std])),
+        (problem.change_mean, problem.change_std),
+    )
+    mean, std = (torch.cat(vectors) for vectors in zip(*parts, strict=True))
+    return Standardizer(mean, std)
+
+
+def read_steps(steps: Steps, scaling: Standardizer) -> EncoderInputs:
+    """The steps in units of the data's standard deviations.
+
+    Args:
+        steps: (tasks, trajectories, steps).
+        scaling: of `transition_scaling`.
+    """
+    changes = steps.next_observations - steps.observations
+    inputs = torch.cat([steps.observations, steps.actions, steps.rewards.unsqueeze(-1), changes], dim=-1)
+    state_action = steps.observations.shape[-1] + steps.actions.shape[-1]
+    return EncoderInputs(scaling(inputs), steps.mask, state_action)
 
 
 @final
@@ -56,24 +86,19 @@ class ContextEncoder(nn.Module):
     ) -> None:
         super().__init__()
         self.state_action = problem.observation_dim + problem.action_dim
-        parts = (
-            (problem.observation_mean, problem.observation_std),
-            (problem.action_mean, problem.action_std),
-            (torch.tensor([problem.reward_mean]), torch.tensor([problem.reward_std])),
-            (problem.change_mean, problem.change_std),
-        )
-        mean, std = (torch.cat(vectors) for vectors in zip(*parts, strict=True))
-        self.scaling = Standardizer(mean, std)
-        self.perceptron = Perceptron((len(mean), *hidden, latent), generator=generator)
+        self.scaling = transition_scaling(problem)
+        self.perceptron = Perceptron((len(self.scaling.mean), *hidden, latent), generator=generator)
 
     def read(self, steps: Steps) -> EncoderInputs:
         """The steps in units of the data's standard deviations."""
-        changes = steps.next_observations - steps.observations
-        inputs = torch.cat([steps.observations, steps.actions, steps.rewards.unsqueeze(-1), changes], dim=-1)
-        return EncoderInputs(self.scaling(inputs), steps.mask, self.state_action)
+        return read_steps(steps, self.scaling)
 
     def forward(self, *groups: EncoderInputs) -> tuple[Float[Tensor, "..."], ...]:
         """Representations of every group, (tasks, trajectories, steps, latent), by one forward pass."""
+        return tuple(torch.tanh(part) for part in self.unbounded(*groups))
+
+    def unbounded(self, *groups: EncoderInputs) -> tuple[Float[Tensor, "..."], ...]:
+        """What `forward` squashes into [-1, 1]."""
         rows = torch.cat([group.inputs.flatten(0, 2) for group in groups])
-        parts = torch.tanh(self.perceptron(rows)).split([group.mask.numel() for group in groups])
+        parts = self.perceptron(rows).split([group.mask.numel() for group in groups])
         return tuple(part.unflatten(0, group.mask.shape) for part, group in zip(parts, groups, strict=True))

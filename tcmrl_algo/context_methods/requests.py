@@ -1,0 +1,17 @@
+"""What batches hold for methods that adapt through a context."""
+
+from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_data import BatchRequest, Trajectories, Transitions
+
+
+def trajectory_request(settings: TrainingSettings) -> BatchRequest:
+    """The `[training.batch]` table without windows: transitions, and two disjoint groups of trajectories."""
+    batch = settings.batch
+    return BatchRequest(
+        batch.tasks,
+        {
+            "policy": Transitions(batch.transitions),
+            "context": Trajectories(batch.context_trajectories),
+            "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
+        },
+    )
