@@ -53,6 +53,39 @@ def test_evaluation_repeats_exactly_and_adds_up(trained: Path, tiny: Dataset, pr
     assert first.mean_shuffled == task.shuffled
 
 
+def test_a_random_first_stage_is_repeated_and_averaged(trained: Path) -> None:
+    once, often = (evaluate_run(trained, protocol="paper", repeats=repeats) for repeats in (1, 4))
+    (single,), (mean,) = once.tasks, often.tasks
+    assert (once.repeats, often.repeats) == (1, 4)
+    assert single.finals == [single.final]
+    assert mean.finals[0] == pytest.approx(single.final)
+    assert len(set(mean.finals)) == 4  # every repeat meets random episodes of its own
+    assert mean.final == pytest.approx(np.mean(mean.finals))
+    assert mean.returns[0] != pytest.approx(single.returns[0])
+    assert often.adaptation_curve == pytest.approx(mean.returns)
+    assert (
+        evaluate_run(trained, protocol="paper").repeats
+        == open_run(trained).record.config.settings.run.repeats
+    )
+
+
+@pytest.mark.parametrize("protocol", ["idaq", "offline"])
+def test_a_protocol_without_a_random_first_stage_is_run_once(trained: Path, protocol: str) -> None:
+    assert evaluate_run(trained, protocol=protocol, repeats=3).repeats == 1
+
+
+def test_final_returns_are_told_apart_by_repeat() -> None:
+    from tcmrl_algo.adaptation.evaluate import _finals
+
+    flags = np.zeros(1, dtype=bool)
+    episodes = [
+        Trajectory(np.zeros((2, 1)), np.zeros((1, 1)), np.array([value]), flags, flags)
+        for value in (1.0, 2.0, 4.0, 3.0, 6.0, 8.0)  # two rounds under three contexts
+    ]
+    assert _finals(episodes, [1, 2]) == [2.0, 5.0]  # contexts' means 2, 4, 6
+    assert _finals(episodes, [3]) == [4.0]
+
+
 def test_without_an_oracle_regret_is_null_and_behavior_norms(
     trained: Path, tiny: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -149,12 +182,12 @@ def test_evaluate_command_prints_the_documented_json(trained: Path, call: Call) 
     document = json.loads(output)
     assert (code, errors) == (0, "")
     assert set(document) == {
-        "algorithm", "environment", "seed", "protocol", "tasks",
+        "algorithm", "environment", "seed", "protocol", "repeats", "tasks", "adaptation_curve",
         "mean_final", "mean_regret", "mean_normalized", "mean_shuffled", "privileged",
     }  # fmt: skip
     (task,) = document["tasks"]
     assert set(task) == {
-        "task", "split", "returns", "final", "oracle", "random",
+        "task", "split", "returns", "final", "finals", "oracle", "random",
         "regret", "normalized", "reference", "success", "shuffled",
     }  # fmt: skip
     assert len(task["returns"]) == 4
@@ -188,11 +221,13 @@ def test_evaluations_by_every_protocol_fit_a_terminal_with_every_number_whole(tr
 
 def test_long_returns_of_twenty_tasks_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     task = TaskResult(
-        task=0, split="test", returns=[], final=-1234.56, oracle=-1023.45, random=-9876.54,
+        task=0, split="test", returns=[], final=-1234.56, finals=[-1234.56], oracle=-1023.45, random=-9876.54,
         regret=1000.0, normalized=0.9, reference="oracle", success=0.25, shuffled=-1234.57,
     )  # fmt: skip
     tasks = [replace(task, task=index) for index in range(20)]
-    result = Evaluation("a_method", "walker-rand-params", 10, "offline", tasks, 0.0, None, None, 0.0, True)
+    result = Evaluation(
+        "a_method", "walker-rand-params", 10, "offline", 1, tasks, [], 0.0, None, None, 0.0, True
+    )
     for table in score_tables([result, replace(result, protocol="a_new_protocol")]):
         print_table(table)  # to a pipe: as wide as its columns
     output = capsys.readouterr().out
@@ -244,7 +279,7 @@ def test_a_protocol_of_another_package_evaluates_beside_ours(trained: Path, call
     code, output, errors = call("evaluate", trained, "--protocol", "all", "--json")
     assert code == 0
     assert [document["protocol"] for document in json.loads(output)] == sorted(
-        ["borrowed", "idaq", "offline", "paper"]
+        ["borrowed", "idaq", "idaq_literal", "offline", "paper"]
     )
     assert "left out: protocol 'torn' of package 'foreign' is broken: ModuleNotFoundError" in errors
     assert_refused(call("evaluate", trained, "--protocol", "torn"), "'torn'", "no_such_module")
@@ -302,5 +337,5 @@ def test_evaluate_command_refuses_bad_input_in_one_line(trained: Path, tmp_path:
 
 
 def test_evaluation_serialises() -> None:
-    evaluation = Evaluation("tcmrl", "point-robot", 0, "idaq", [], 0.0, None, None, 0.0, False)
+    evaluation = Evaluation("tcmrl", "point-robot", 0, "idaq", 1, [], [], 0.0, None, None, 0.0, False)
     assert json.loads(json.dumps(evaluation.to_json()))["mean_regret"] is None

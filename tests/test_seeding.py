@@ -59,4 +59,6 @@ def test_purposes_keep_their_numbers() -> None:
         "SUBSET": 14,
         "FOLDS": 15,
         "EXTENSION_NOISE": 16,
+        "EVALUATION_CANDIDATES": 17,
+        "CONTROL_RESET": 18,
     }

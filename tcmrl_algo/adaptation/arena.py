@@ -3,6 +3,9 @@
 from collections.abc import Callable, Sequence
 from typing import final
 
+import numpy as np
+import numpy.typing as npt
+
 from tcmrl_algo.methods.base import Algorithm, Capabilities
 from tcmrl_algo.methods.privileged import TaskParameters
 from tcmrl_algo.settings.run import RunSettings
@@ -21,6 +24,11 @@ from tcmrl_data import (
 
 MOST_LANES = 50
 """Most episodes that are stepped together; this many Meta-World lanes take 1 GB and 8 s to create."""
+
+KEPT_BYTES = 2 * 2**30
+"""Most memory of simulators that are kept for the next episodes of the same tasks."""
+
+FloatArray = npt.NDArray[np.floating]
 
 Context = Sequence[Trajectory]
 """Trajectories that a policy adapts to; an empty context is the prior of a method that has one."""
@@ -61,7 +69,7 @@ class Arena:
         self._capabilities = capabilities
         self._parameters = TaskParameters(dataset.train_tasks) if capabilities.privileged else None
         self._stage, self._done, self._total = "", 0, 0
-        self._lanes: tuple[tuple[int, ...], Lanes] | None = None
+        self._lanes: dict[tuple[int, ...], Lanes] = {}
         self._stored: dict[int, list[Trajectory]] = {}
 
     def begin(self, stage: str, total: int) -> None:
@@ -82,18 +90,13 @@ class Arena:
             TrainingError: an empty context, for a method that needs trajectories.
         """
         self._check_contexts(tasks, contexts)
-        trajectories: list[Trajectory] = []
-        for start in range(0, len(tasks), MOST_LANES):
-            lanes = slice(start, start + MOST_LANES)
-            controller = self._adapt(tasks[lanes], contexts[lanes])
-            trajectories += self._run(tasks[lanes], controller, episode=episode, first_lane=start)
-        return trajectories
+        return self._run(tasks, contexts, self._adapt, episode=episode)
 
     def explored(
         self, tasks: Sequence[Task], collected: Sequence[Context], *, episode: int
     ) -> list[Trajectory]:
         """One episode per lane by the exploration of the method, which is uniform actions by default."""
-        return self._run(tasks, self._algorithm.explore(collected), episode=episode, first_lane=0)
+        return self._run(tasks, collected, self._explore, episode=episode)
 
     def stored(self, task: Task, *, draw: int) -> Context:
         """Draws `offline_trajectories` stored trajectories of a task without replacement."""
@@ -106,11 +109,22 @@ class Arena:
         random = keyed_generator(self._seed, self.dataset.name, task.index, Purpose.EVALUATION_CONTEXT, draw)
         return [stored[index] for index in random.choice(len(stored), number, replace=False)]
 
+    def candidates(self, task: Task, *, episode: int, lane: int) -> list[Task]:
+        """Draws `candidates` training tasks with replacement, anew for every episode of every lane."""
+        training = self.dataset.train_tasks
+        key = (self._seed, self.dataset.name, task.index, Purpose.EVALUATION_CANDIDATES, episode, lane)
+        drawn = keyed_generator(*key).choice(len(training), self.settings.candidates)
+        return [training[index] for index in drawn]
+
+    def latents(self, contexts: Sequence[Context]) -> FloatArray:
+        """Contexts as vectors (contexts, latent); of no dimension if the method has none."""
+        found = self._algorithm.latents(contexts)
+        return np.zeros((len(contexts), 0)) if found is None else found.cpu().numpy()
+
     def close(self) -> None:
-        """Closes the lanes."""
-        if self._lanes is not None:
-            self._lanes[1].close()
-        self._lanes = None
+        """Closes all lanes."""
+        while self._lanes:
+            self._lanes.popitem()[1].close()
 
     def _check_contexts(self, tasks: Sequence[Task], contexts: Sequence[Context]) -> None:
         if not self._capabilities.needs_trajectories:
@@ -129,32 +143,46 @@ class Arena:
             return self._algorithm.adapt(contexts)
         return self._algorithm.adapt(contexts, privileged=self._parameters(tasks))
 
+    def _explore(self, tasks: Sequence[Task], collected: Sequence[Context]) -> Controller:
+        return self._algorithm.explore(collected)
+
     def _lanes_of(self, tasks: Sequence[Task]) -> Lanes:
-        """Lanes of the tasks; the last lanes are kept, because adaptation repeats the same tasks."""
-        key = tuple(task.index for task in tasks)
-        if self._lanes is None or self._lanes[0] != key:
-            self.close()
-            self._lanes = (key, self.dataset.environment.lanes([task.parameters for task in tasks]))
-        return self._lanes[1]
+        """Lanes of the tasks. They are kept, because adaptation repeats tasks; the oldest give way."""
+        key, environment = tuple(task.index for task in tasks), self.dataset.environment
+        if key not in self._lanes:
+            kept = KEPT_BYTES // max(1, environment.simulator_bytes) - len(key)
+            while self._lanes and sum(map(len, self._lanes)) > kept:
+                self._lanes.pop(next(iter(self._lanes))).close()
+            self._lanes[key] = environment.lanes([task.parameters for task in tasks])
+        return self._lanes[key]
 
     def _run(
-        self, tasks: Sequence[Task], controller: Controller, *, episode: int, first_lane: int
+        self,
+        tasks: Sequence[Task],
+        contexts: Sequence[Context],
+        control: Callable[[Sequence[Task], Sequence[Context]], Controller],
+        *,
+        episode: int,
     ) -> list[Trajectory]:
-        environment, name = self.dataset.environment, self.dataset.name
-        places = [(task.index, first_lane + lane) for lane, task in enumerate(tasks)]
-        trajectories = roll_out(
-            environment,
-            self._lanes_of(tasks),
-            controller,
-            reset_seeds=[
-                keyed_seed(self._seed, name, task, Purpose.EVALUATION_RESET, episode, lane)
-                for task, lane in places
-            ],
-            noise=[
-                keyed_generator(self._seed, name, task, Purpose.EVALUATION_NOISE, episode, lane)
-                for task, lane in places
-            ],
-        )
-        self._done += len(tasks)
-        self._report(self._stage, self._done, self._total)
+        """One episode per lane, at most MOST_LANES at a time; the position of a lane is part of its keys."""
+        trajectories: list[Trajectory] = []
+        for start in range(0, len(tasks), MOST_LANES):
+            chunk = slice(start, start + MOST_LANES)
+            keys = [(task.index, start + lane) for lane, task in enumerate(tasks[chunk])]
+            run, name = self._seed, self.dataset.name
+            trajectories += roll_out(
+                self.dataset.environment,
+                self._lanes_of(tasks[chunk]),
+                control(tasks[chunk], contexts[chunk]),
+                reset_seeds=[
+                    keyed_seed(run, name, task, Purpose.EVALUATION_RESET, episode, lane)
+                    for task, lane in keys
+                ],
+                noise=[
+                    keyed_generator(run, name, task, Purpose.EVALUATION_NOISE, episode, lane)
+                    for task, lane in keys
+                ],
+            )
+            self._done += len(keys)
+            self._report(self._stage, self._done, self._total)
         return trajectories

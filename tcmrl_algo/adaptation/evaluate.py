@@ -30,8 +30,9 @@ class TaskResult:
     Attributes:
         task: index of the task.
         split: `test`.
-        returns: returns of the adaptation episodes.
+        returns: returns of the adaptation episodes, means over the repeats of the protocol.
         final: mean return of the adapted policy.
+        finals: the same for every repeat; their spread is that of the protocol's own chance.
         oracle: return of a controller that knows the task, None if the environment has none.
         random: return of uniform actions, None if it was not measured.
         regret: oracle - final, None without an oracle.
@@ -48,6 +49,7 @@ class TaskResult:
     split: str
     returns: list[float]
     final: float
+    finals: list[float]
     oracle: float | None
     random: float | None
     regret: float | None
@@ -61,14 +63,24 @@ class TaskResult:
 class Evaluation:
     """Result of a run on all test tasks; means are over tasks, and None if a task has no value.
 
-    `privileged` marks a control that observes the task parameters.
+    Attributes:
+        algorithm, environment, seed, protocol: which evaluation this is.
+        repeats: how many times the protocol was run; 1 unless its first stage is random.
+        tasks: results by test task.
+        adaptation_curve: mean returns of the first, second, … adaptation episode: how many episodes it
+            takes until the policy is adapted. The episodes are those of the protocol; under `paper` the
+            first ones act uniformly.
+        mean_final, mean_regret, mean_normalized, mean_shuffled: means of the tasks' values.
+        privileged: whether the method is a control that observes the task parameters.
     """
 
     algorithm: str
     environment: str
     seed: int
     protocol: str
+    repeats: int
     tasks: list[TaskResult]
+    adaptation_curve: list[float]
     mean_final: float
     mean_regret: float | None
     mean_normalized: float | None
@@ -86,6 +98,7 @@ def evaluate_run(
     protocol: str | None = None,
     dataset_path: str | Path | None = None,
     episodes: int | None = None,
+    repeats: int | None = None,
     report: ProgressCallback = ignore_progress,
 ) -> Evaluation:
     """Evaluates the newest checkpoint of a run, and logs the means in the folder of the run.
@@ -95,6 +108,7 @@ def evaluate_run(
         protocol: replaces the protocol of the run.
         dataset_path: folder of the run's dataset, if the dataset was moved.
         episodes: replaces the number of adaptation episodes per task of the run.
+        repeats: replaces `run.repeats`, how many times a protocol with a random first stage is run.
         report: called when episodes end.
 
     Raises:
@@ -109,7 +123,7 @@ def evaluate_run(
     run = open_run(run_folder)
     dataset = run.open_dataset(dataset_path)
     settings = run.record.config.settings.run
-    changes = {"protocol": protocol, "episodes": episodes}
+    changes = {"protocol": protocol, "episodes": episodes, "repeats": repeats}
     settings = settings.model_copy(update={key: value for key, value in changes.items() if value is not None})
     torch.set_num_threads(settings.threads)
     evaluation = evaluate_open_run(run, dataset, settings, report=report)
@@ -139,10 +153,11 @@ def evaluate_open_run(
     method, _ = method_of(run.record.config)
     seed = run.record.seed
     arena = Arena(dataset, algorithm, settings, capabilities=method.capabilities, seed=seed, report=report)
+    repeats = settings.repeats if protocol.repeated else 1
     try:
-        arena.begin("adaptation", len(tasks) * settings.episodes)
-        adaptations = protocol.adapt(arena, tasks)
-        results = _results(arena, tasks, adaptations)
+        arena.begin("adaptation", len(tasks) * repeats * settings.episodes)
+        adaptations = protocol.adapt(arena, [task for task in tasks for _ in range(repeats)])
+        results = _results(arena, tasks, [adaptations[repeats * i :][:repeats] for i in range(len(tasks))])
     finally:
         arena.close()
     return Evaluation(
@@ -150,7 +165,9 @@ def evaluate_open_run(
         environment=dataset.name,
         seed=seed,
         protocol=settings.protocol,
+        repeats=repeats,
         tasks=results,
+        adaptation_curve=[fmean(returns) for returns in zip(*(one.returns for one in results), strict=False)],
         mean_final=fmean(result.final for result in results),
         mean_regret=_mean([result.regret for result in results]),
         mean_normalized=_mean([result.normalized for result in results]),
@@ -159,15 +176,21 @@ def evaluate_open_run(
     )
 
 
-def _results(arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Adaptation]) -> list[TaskResult]:
-    own = {task.index: adaptation.contexts for task, adaptation in zip(tasks, adaptations, strict=True)}
+def _results(
+    arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Sequence[Adaptation]]
+) -> list[TaskResult]:
+    """Results of every task, given its adaptations, one per repeat."""
+    own = {
+        task.index: [context for adaptation in repeats for context in adaptation.contexts]
+        for task, repeats in zip(tasks, adaptations, strict=True)
+    }
     others = {task.index: contexts_of_others(arena, task, own) for task in tasks}
     num_contexts = sum(len(contexts) for contexts in (*own.values(), *others.values()))
     arena.begin("final episodes", num_contexts * arena.settings.final_episodes)
     final = _final_episodes(arena, tasks, own)
     shuffled = _final_episodes(arena, tasks, others)
     results = []
-    for task, adaptation in zip(tasks, adaptations, strict=True):
+    for task, repeats in zip(tasks, adaptations, strict=True):
         references = arena.dataset.references(task.index)
         mean = _mean_return(final[task.index])
         best = references.behavior if references.oracle is None else references.oracle
@@ -175,8 +198,9 @@ def _results(arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Adaptati
             TaskResult(
                 task=task.index,
                 split=task.split,
-                returns=adaptation.returns,
+                returns=[fmean(found) for found in zip(*(one.returns for one in repeats), strict=True)],
                 final=mean,
+                finals=_finals(final[task.index], [len(one.contexts) for one in repeats]),
                 oracle=references.oracle,
                 random=references.uniform,
                 regret=None if references.oracle is None else references.oracle - mean,
@@ -217,6 +241,13 @@ def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) 
 def _key(context: Context) -> tuple[int, ...]:
     """Identifies a context by its trajectories."""
     return tuple(id(trajectory) for trajectory in context)
+
+
+def _finals(trajectories: Sequence[Trajectory], num_contexts: Sequence[int]) -> list[float]:
+    """Mean final return of every repeat, whose contexts follow one another in every round of episodes."""
+    returns = np.array([trajectory.undiscounted_return for trajectory in trajectories])
+    by_context = returns.reshape(-1, sum(num_contexts)).mean(axis=0)
+    return [float(part.mean()) for part in np.split(by_context, np.cumsum(num_contexts)[:-1])]
 
 
 def _final_episodes(

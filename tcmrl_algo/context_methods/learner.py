@@ -64,6 +64,10 @@ class ContextLearner(nn.Module, abc.ABC):
     def context(self, steps: Steps) -> Float[Tensor, "lanes latent"]:
         """One context per lane, of all its trajectories together: (lanes, trajectories, steps)."""
 
+    def known_context(self, privileged: Float[Tensor, "lanes parameters"]) -> Float[Tensor, "lanes latent"]:
+        """One context per lane of the task parameters that a method with the capability observes."""
+        raise NotImplementedError(f"{type(self).__name__} makes no context of task parameters")
+
     def explore(self, actor_critic: ActorCritic, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         """As `Algorithm.explore`, for a method that collects its first episodes with its policy."""
         return UniformController()
@@ -148,7 +152,12 @@ class ContextAlgorithm(Algorithm):
     def adapt(
         self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
     ) -> Controller:
+        if privileged is not None:
+            return self.actor_critic.controller(self.learner.known_context(privileged))
         return self.actor_critic.controller(self.context(trajectories))
+
+    def latents(self, trajectories: Sequence[Sequence[Trajectory]]) -> Tensor:
+        return self.context(trajectories)
 
     def context(self, trajectories: Sequence[Sequence[Trajectory]]) -> Float[Tensor, "lanes latent"]:
         """One context per lane, of all its trajectories together."""

@@ -84,9 +84,12 @@ def run_job(job: Job, report: Send) -> str:
     for step in job.points()[len(curve) :]:
         timed_steps, seconds = _train_to(step, job, dataset, report)
         began = time.perf_counter()
-        chosen = job.protocols if step == job.points()[-1] else job.protocols[:1]
+        is_last = step == job.points()[-1]
         evaluations = {
-            protocol: evaluate_run(folder, protocol=protocol, dataset_path=job.dataset) for protocol in chosen
+            protocol: evaluate_run(
+                folder, protocol=protocol, dataset_path=job.dataset, repeats=None if is_last else 1
+            )
+            for protocol in (job.protocols if is_last else job.protocols[:1])
         }
         first = evaluations[job.protocols[0]]
         point = CurvePoint(

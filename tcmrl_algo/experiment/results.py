@@ -44,7 +44,8 @@ class CurvePoint(_Record):
     Attributes:
         step: training steps done.
         stage: of training, at that step.
-        final, regret, normalized, shuffled: means over test tasks under the experiment's first protocol.
+        final, regret, normalized, shuffled: means over test tasks under the experiment's first protocol; of
+            one repeat of it except at the last point, so that evaluation does not outlast training.
         timed_steps, seconds: of training since the last point, as far as this process did it.
         evaluation_seconds: of all evaluation at this point.
         peak_memory: bytes, of the process, so far.

@@ -83,6 +83,13 @@ class Algorithm(abc.ABC):
         """
         return UniformController()
 
+    def latents(self, trajectories: Sequence[Sequence[Trajectory]]) -> Tensor | None:
+        """Contexts of lanes as vectors (lanes, latent), whose distances a protocol may compare.
+
+        None for a method that does not adapt through such a vector.
+        """
+        return None
+
     @abc.abstractmethod
     def tensors(self) -> dict[str, Tensor]:
         """Everything that training changes: parameters, buffers, optimiser state, by name."""

@@ -25,10 +25,15 @@ class RunSettings(BaseModel):
         log_every: steps between two lines of metrics.
         checkpoint_every: steps between two checkpoints.
         protocol: how to adapt to test tasks (paper, section 4.2: `paper`).
-        episodes: adaptation episodes per test task.
-        random_episodes: how many of them act uniformly, under `paper`; 0 begins with the prior of a method
-            that needs no trajectories.
-        offline_trajectories: stored trajectories that make one context, under `offline`.
+        episodes: adaptation episodes per test task, of all protocols and all methods.
+        random_episodes: how many of them form the first stage: uniform actions under `paper`, tried contexts
+            of training tasks under `idaq_literal` (published code: one setting for both). 0 begins `paper`
+            with the prior of a method that needs no trajectories.
+        candidates: how many training tasks are drawn for every episode of the first stage of `idaq_literal`,
+            of which the one with the most distant context is tried.
+        repeats: how many times a protocol with a random first stage is run, by independent seeds; results
+            are means.
+        offline_trajectories: stored trajectories in a context, under `offline` and of training tasks.
         final_episodes: episodes of the adapted policy that its final return averages over.
     """
 
@@ -44,6 +49,8 @@ class RunSettings(BaseModel):
     checkpoint_every: int = Field(default=5_000, ge=1)
     protocol: str = "paper"
     episodes: int = Field(default=10, ge=1)
-    random_episodes: int = Field(default=2, ge=0)
+    random_episodes: int = Field(default=5, ge=0)
+    candidates: int = Field(default=5, ge=1)
+    repeats: int = Field(default=5, ge=1)
     offline_trajectories: int = Field(default=4, ge=1)
     final_episodes: int = Field(default=1, ge=1)

@@ -29,6 +29,8 @@ class Purpose(enum.IntEnum):
     SUBSET = 14
     FOLDS = 15
     EXTENSION_NOISE = 16
+    EVALUATION_CANDIDATES = 17
+    CONTROL_RESET = 18
 
 
 def environment_key(environment: str) -> int:

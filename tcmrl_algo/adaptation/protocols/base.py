@@ -29,9 +29,13 @@ class Protocol(abc.ABC):
     """Adapts to test tasks. A protocol is a plug-in without state, created without arguments.
 
     A package declares a protocol as an entry point of the group `tcmrl.protocols` with the name `name`.
+    Every method gets the same numbers of episodes under a protocol, those of the environment's recipe; a
+    method cannot ask for more.
 
     Attributes:
         name: the value of `--protocol`, of `run.protocol` and in `protocols` of an experiment.
+        repeated: whether the first stage is random, so that evaluation adapts `run.repeats` times to every
+            task and averages.
 
     Example:
         >>> PROTOCOLS.get("offline").name
@@ -39,14 +43,16 @@ class Protocol(abc.ABC):
     """
 
     name: ClassVar[str]
+    repeated: ClassVar[bool] = False
 
     @abc.abstractmethod
     def adapt(self, arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
-        """Adapts to every task with `arena.settings.episodes` episodes; returns one adaptation per task.
+        """Adapts to every task with `arena.settings.episodes` episodes; returns one adaptation per entry.
 
         Args:
             arena: runs episodes and draws stored trajectories.
-            tasks: the test tasks.
+            tasks: the test tasks; of a repeated protocol every task `run.repeats` times, as lanes whose
+                random draws are independent.
         """
 
 

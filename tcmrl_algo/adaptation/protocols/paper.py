@@ -17,6 +17,7 @@ class PaperProtocol(Protocol):
     """
 
     name = "paper"
+    repeated = True
 
     def adapt(self, arena: Arena, tasks: Sequence[Task]) -> list[Adaptation]:
         settings = arena.settings
