@@ -1,7 +1,9 @@
 """Shared fixtures: one real, tiny dataset, built once per session with the real libraries."""
 
+import os
 import shutil
 import sys
+import tempfile
 import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -116,6 +118,14 @@ def tiny_folder(
 @pytest.fixture(scope="session")
 def tiny(tiny_folder: Path) -> Dataset:
     return tcmrl_data.open_dataset(tiny_folder)
+
+
+@pytest.fixture
+def memory() -> Iterator[Path]:
+    """A folder in memory if the system has one, because thousands of syncs on a disk are slow."""
+    shared = Path("/dev/shm")
+    with tempfile.TemporaryDirectory(dir=shared if os.access(shared, os.W_OK) else None) as folder:
+        yield Path(folder)
 
 
 @pytest.fixture

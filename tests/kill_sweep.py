@@ -1,6 +1,8 @@
-"""Builds that are killed at random until they complete: `python -m tests.kill_sweep --kills 200`.
+"""Commands that are killed at random and given again until they end.
 
-Every build is compared with one that nobody killed: same ids, same root, no staging after gc, no orphans.
+What they make is compared with what they make when nobody kills them: same ids, same root, no staging after
+gc, no orphans. `python -m tests.kill_sweep --kills 200` kills builds, `python -m tests.killed_commands` the
+other commands.
 """
 
 import argparse
@@ -14,16 +16,26 @@ import sys
 import tempfile
 import time
 import uuid
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from tcmrl_data import Dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.disk import STAGING, lock_file, remove_abandoned
+from tcmrl_data.store.keys import PARTS
+from tcmrl_data.store.manifest import MANIFEST
+from tests.workers import MARK, marked_pids
 
-MARK = "TCMRL_KILL_SWEEP"
 ORPHAN_SECONDS = 60.0
 """A worker that still lives so long after its driver is an orphan."""
+
+START = """
+import tcmrl_data.build.build, tcmrl_data.curation.extend, tcmrl_data.interchange.importing
+from tcmrl_cli.data import main
+print("ready", flush=True)
+main()
+"""
+"""Kills are counted from `ready` on, when Python and the modules are loaded."""
 
 
 @dataclass
@@ -33,7 +45,7 @@ class Figures:
     kills: int = 0
     driver_kills: int = 0
     worker_kills: int = 0
-    builds: int = 0
+    finished: int = 0
     parts_lost: int = 0
     parts_duplicated: int = 0
     findings: int = 0
@@ -42,42 +54,60 @@ class Figures:
     orphans: int = 0
 
 
-def command(out: Path, arguments: Sequence[str]) -> list[str]:
-    """A build of point-robot-wind in a separate process."""
-    start = "from tcmrl_cli.data import main; main()"
-    options = ["--profile", "quick", "--workers", "2", "--out", str(out), "--quiet"]
-    return [sys.executable, "-c", start, "build", "point-robot-wind", *options, *arguments]
+@dataclass(frozen=True)
+class Case:
+    """A command of `tcmrl-data` that makes or changes a dataset.
+
+    Attributes:
+        arguments: of the command, by the dataset's folder.
+        parts: number of parts of the dataset; a kill waits until a random number of them is there.
+        pause: longest time that it waits then, in seconds.
+        has_workers: whether the command starts processes, which are killed too.
+        begin: makes what is in the folder before the command.
+    """
+
+    arguments: Callable[[Path], Sequence[object]]
+    parts: int
+    pause: float
+    has_workers: bool = False
+    begin: Callable[[Path], object] = lambda out: None
 
 
-def marked(mark: str) -> list[int]:
-    """Processes that carry the mark in their environment, the oldest first."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        if entry.name.isdecimal():
-            try:
-                if f"{MARK}={mark}".encode() in (entry / "environ").read_bytes():
-                    found.append(int(entry.name))
-            except OSError:
-                continue  # it ended, or belongs to another user
-    return sorted(found)
+def start(case: Case, out: Path, errors: int, mark: str) -> "subprocess.Popen[bytes]":
+    """The command in a process of its own, which has loaded its modules."""
+    arguments = [sys.executable, "-c", START, *map(str, case.arguments(out)), "--quiet"]
+    process = subprocess.Popen(
+        arguments, stdout=subprocess.PIPE, stderr=errors, env=os.environ | {MARK: mark}, cwd=Path.cwd()
+    )
+    assert process.stdout is not None
+    process.stdout.readline()
+    return process
 
 
 def kill_once(
-    process: "subprocess.Popen[bytes]", mark: str, seconds: float, figures: Figures, dice: random.Random
+    process: "subprocess.Popen[bytes]",
+    case: Case,
+    out: Path,
+    mark: str,
+    figures: Figures,
+    dice: random.Random,
 ) -> None:
     """Waits, kills the driver, a worker or all of them, and counts processes that outlive the driver.
 
     If a worker is to be killed, the waiting time starts when the first worker runs.
     """
-    what = dice.choice(["driver", "worker", "all"])
-    while what != "driver" and process.poll() is None and len(marked(mark)) < 2:
-        time.sleep(0.02)
+    what = dice.choice(["driver", "worker", "all"]) if case.has_workers else "driver"
+    wanted, seconds = dice.randint(0, case.parts), dice.uniform(0.0, case.pause)
+    while process.poll() is None and (
+        len(list((out / PARTS).rglob("*.zip"))) < wanted or (what != "driver" and len(marked_pids(mark)) < 2)
+    ):
+        time.sleep(0.002)
     try:
         process.wait(timeout=seconds)
         return
     except subprocess.TimeoutExpired:
         pass
-    workers = [pid for pid in marked(mark) if pid != process.pid]
+    workers = [pid for pid in sorted(marked_pids(mark)) if pid != process.pid]
     victims = {"driver": [process.pid], "worker": workers[:1], "all": [process.pid, *workers]}[what]
     for pid in victims:
         try:
@@ -91,34 +121,45 @@ def kill_once(
         return
     process.wait()
     deadline = time.monotonic() + ORPHAN_SECONDS
-    while marked(mark) and time.monotonic() < deadline:
+    while marked_pids(mark) and time.monotonic() < deadline:
         time.sleep(0.02)
-    for orphan in marked(mark):
+    for orphan in marked_pids(mark):
         figures.orphans += 1
         os.kill(orphan, signal.SIGKILL)
 
 
-def build_under_fire(
-    out: Path, arguments: Sequence[str], figures: Figures, dice: random.Random, *, kills: int, pause: float
-) -> Dataset:
-    """Builds a dataset to its end, killing until the sweep has its number of kills."""
+def finish_under_fire(case: Case, out: Path, figures: Figures, dice: random.Random, *, kills: int) -> Dataset:
+    """Gives a command again and again until it ends, killing until the sweep has its number of kills.
+
+    Raises:
+        RuntimeError: the command fails although nothing was killed.
+    """
     mark = uuid.uuid4().hex
     while True:
-        with subprocess.Popen(command(out, arguments), env=os.environ | {MARK: mark}) as process:
-            while process.poll() is None:
-                if figures.kills < kills:
-                    kill_once(process, mark, dice.uniform(0.2, pause), figures, dice)
-                else:
-                    process.wait()
-        if process.returncode == 0:
+        killed = figures.kills
+        with tempfile.TemporaryFile() as errors:
+            with start(case, out, errors.fileno(), mark) as process:
+                while process.poll() is None:
+                    if figures.kills < kills:
+                        kill_once(process, case, out, mark, figures, dice)
+                    else:
+                        process.wait()
+            errors.seek(0)
+            said = errors.read().decode()
+        if (out / MANIFEST).exists():
+            figures.findings += sum(not finding.foreign for finding in verify_dataset(out).findings)
+        # a dataset that was whole before the kill is refused as one that exists
+        if process.returncode == 0 or (process.returncode == 2 and "exists and is not empty" in said):
             return open_dataset(out)
+        if figures.kills == killed:
+            raise RuntimeError(f"exit code {process.returncode}: {said}")
 
 
 def compare(dataset: Dataset, reference: Dataset, figures: Figures) -> None:
     """Adds to the figures what differs from the reference."""
     out, expected = dataset.folder, {entry.key: entry.id for entry in reference.parts.entries()}
     found = {entry.key: entry.id for entry in dataset.parts.entries()}
-    figures.builds += 1
+    figures.finished += 1
     figures.parts_lost += sum(not dataset.file_of(key).is_file() for key in expected)
     figures.parts_lost += sum(found.get(key) != part for key, part in expected.items())
     figures.parts_duplicated += len(list(out.rglob("*.zip"))) - len(expected)
@@ -130,18 +171,24 @@ def compare(dataset: Dataset, reference: Dataset, figures: Figures) -> None:
     figures.staging_left += len(list((out / STAGING).iterdir()))
 
 
-def run_sweep(kills: int, *, pause: float, seed: int, arguments: Sequence[str]) -> Figures:
-    """Kills builds until `kills` processes have died; every build is then run to its end."""
+def run_sweep(case: Case, kills: int, *, seed: int) -> Figures:
+    """Kills a command until `kills` processes have died; every one is then left to end."""
     figures, dice = Figures(), random.Random(seed)
     with tempfile.TemporaryDirectory() as folder:
-        reference = Path(folder) / "reference"
-        subprocess.run(command(reference, arguments), check=True)
+        reference, out = Path(folder) / "reference", Path(folder) / "killed"
+        case.begin(reference)
+        made = finish_under_fire(case, reference, figures, dice, kills=0)
         while figures.kills < kills:
-            out = Path(folder) / "killed"
-            dataset = build_under_fire(out, arguments, figures, dice, kills=kills, pause=pause)
-            compare(dataset, open_dataset(reference), figures)
+            case.begin(out)
+            compare(finish_under_fire(case, out, figures, dice, kills=kills), made, figures)
             shutil.rmtree(out)
     return figures
+
+
+def build(arguments: Sequence[str], *, pause: float) -> Case:
+    """A build of point-robot-wind; a kill comes at any time."""
+    options = ["build", "point-robot-wind", "--profile", "quick", "--workers", "2", *arguments]
+    return Case(lambda out: [*options, "--out", out], 0, pause, has_workers=True)
 
 
 def main() -> None:
@@ -155,7 +202,7 @@ def main() -> None:
     parser.add_argument("arguments", nargs="*", help="further arguments of `tcmrl-data build`, after --")
     options = parser.parse_args()
     started = time.monotonic()
-    figures = run_sweep(options.kills, pause=options.pause, seed=options.seed, arguments=options.arguments)
+    figures = run_sweep(build(options.arguments, pause=options.pause), options.kills, seed=options.seed)
     print(json.dumps(asdict(figures) | {"seconds": round(time.monotonic() - started)}))  # noqa: T201
 
 

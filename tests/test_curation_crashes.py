@@ -1,53 +1,110 @@
-"""Derivations and unions whose file operations fail, whose power is cut, or that are killed."""
+"""Commands that make datasets, with file operations that fail or a power cut, and then given again."""
 
-import os
-import random
 import shutil
-import signal
-import subprocess
-import sys
-import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
-from tcmrl_data import Dataset, TcmrlError, derive_dataset, merge_datasets, open_dataset, verify_dataset
+from tcmrl_data import (
+    Dataset,
+    derive_dataset,
+    extend_dataset,
+    import_dataset,
+    merge_datasets,
+    open_dataset,
+    verify_dataset,
+)
 from tcmrl_data.build.work_files import ASSEMBLY
+from tcmrl_data.curation.remaking import ENGINES
+from tcmrl_data.engine.base import Unit
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import STAGING, remove_abandoned
+from tcmrl_data.interchange.formats.hdf5 import Hdf5Format
+from tcmrl_data.store import tables
+from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import MANIFEST
 from tests.graded import graded_dataset
-from tests.simulated_disk import FAULTS, LOSSES, Fault, FaultyDisk, Operation, PowerCut, RecordingDisk
+from tests.simulated_disk import (
+    FAULTS,
+    LOSSES,
+    Fault,
+    Operation,
+    PowerCut,
+    RecordingDisk,
+    prepared_engine,
+    run_with_fault,
+)
 
-Command = Callable[[list[Path], Path], object]
-COMMANDS: dict[str, Command] = {
-    "derive": lambda sources, out: derive_dataset(sources[0], out, tier="medium-replay"),
-    "cut": lambda sources, out: derive_dataset(sources[0], out, tasks=[0], episodes=2, tier="medium-expert"),
-    "merge": lambda sources, out: merge_datasets(sources, out),
+
+@dataclass(frozen=True)
+class Sources:
+    """What the commands read.
+
+    Attributes:
+        seeds: two datasets of equal tasks.
+        small: a built dataset of two parts.
+        extended: that dataset after its extension; its new parts are published again as workers do.
+        exported: a file that holds one task of the seeds.
+    """
+
+    seeds: list[Path]
+    small: Path
+    extended: Dataset
+    exported: Path
+
+    def extend(self, folder: Path, out: Path | None = None) -> None:
+        """Extends the small dataset in a folder, without the seconds that rollouts take."""
+        files = {key: self.extended.content(key) for key in self.extended.parts if key.run == "extended"}
+        target = folder if out is None else out
+
+        def keys_of(unit: Unit) -> Sequence[PartKey]:
+            return [PartKey(*key) for _, key in unit.spec["jobs"]]
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(
+                ENGINES, "get", lambda name: lambda workers: prepared_engine(target, files, keys_of)
+            )
+            extend_dataset(folder, out=out, episodes=3, workers=1)
+
+
+Command = Callable[[Sources, Path], object]
+NEW: dict[str, Command] = {
+    "derive": lambda sources, out: derive_dataset(sources.seeds[0], out, tier="medium-replay"),
+    "cut": lambda sources, out: derive_dataset(sources.seeds[0], out, episodes=2, tier="medium-expert"),
+    "merge": lambda sources, out: merge_datasets(sources.seeds, out),
+    "extend to a new dataset": lambda sources, out: sources.extend(sources.small, out),
+    "import": lambda sources, out: import_dataset("hdf5", [sources.exported], out),
 }
-
-
-@pytest.fixture
-def memory() -> Iterator[Path]:
-    """A folder in memory if the system has one, because thousands of syncs on a disk are slow."""
-    shared = Path("/dev/shm")
-    with tempfile.TemporaryDirectory(dir=shared if os.access(shared, os.W_OK) else None) as folder:
-        yield Path(folder)
+IN_PLACE: dict[str, Command] = {"extend": lambda sources, out: sources.extend(out)}
+COMMANDS = NEW | IN_PLACE
 
 
 @pytest.fixture(scope="module")
-def sources(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+def sources(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Sources:
     folder = tmp_path_factory.mktemp("sources")
     scores = {0: 0.0, 100: 40.0, 200: 90.0}
-    return [graded_dataset(folder / f"{seed}", seed=seed, scores=scores).folder for seed in range(2)]
+    seeds = [
+        graded_dataset(folder / f"{seed}", seed=seed, scores=scores, tasks=(0, 3)).folder for seed in range(2)
+    ]
+    exported, *_ = Hdf5Format().export(open_dataset(seeds[0]), folder / "hdf5")
+    derive_dataset(tiny, folder / "small", tasks=[0, 99], snapshots="last")
+    extend_dataset(folder / "small", out=folder / "extended", episodes=3, workers=2)
+    return Sources(seeds, folder / "small", open_dataset(folder / "extended"), exported)
 
 
-def expect_whole(command: Command, sources: list[Path], out: Path, expected: Dataset, place: str) -> None:
+def begin(name: str, sources: Sources, out: Path) -> None:
+    """Makes what stands before a command: the dataset that it changes, or the folder of the new one."""
+    out.parent.mkdir(exist_ok=True)
+    if name in IN_PLACE:
+        shutil.copytree(sources.small, out)
+
+
+def expect_whole(name: str, sources: Sources, out: Path, expected: Dataset, place: str) -> None:
     """Checks that the same command, given again, ends with each part of the reference once."""
-    if not (out / MANIFEST).exists() or (out / ASSEMBLY).exists():
-        command(sources, out)
+    if name in IN_PLACE or not (out / MANIFEST).exists() or (out / ASSEMBLY).exists():
+        COMMANDS[name](sources, out)
     made = open_dataset(out)
     assert made.manifest.digest == expected.manifest.digest, place
     found = sorted(file.relative_to(out) for file in out.rglob("*.zip"))
@@ -59,58 +116,45 @@ def expect_whole(command: Command, sources: list[Path], out: Path, expected: Dat
     assert list((out / STAGING).iterdir()) == [], place
 
 
-def logged(command: Command, sources: list[Path], out: Path) -> list[Operation]:
+def logged(name: str, sources: Sources, out: Path) -> list[Operation]:
     """All file operations of a command."""
-    out.parent.mkdir()
+    begin(name, sources, out)
     recorder = RecordingDisk()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(publish, "disk", recorder)
-        command(sources, out)
+        patch.setattr(tables, "disk", recorder)
+        COMMANDS[name](sources, out)
     return recorder.log
-
-
-def run_with_fault(command: Command, sources: list[Path], out: Path, at: int, fault: Fault) -> int:
-    """Runs a command in a forked process whose disk fails at one operation; its exit status."""
-    child = os.fork()
-    if child:
-        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    status = 3
-    try:
-        publish.disk = FaultyDisk(at, fault)
-        command(sources, out)
-        status = 0
-    except TcmrlError:
-        status = 1
-    finally:
-        os._exit(status)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_same_command_recovers_from_a_fault_at_any_operation(
-    sources: list[Path], memory: Path, name: str, fault: Fault, sweep: int
+    sources: Sources, memory: Path, name: str, fault: Fault, sweep: int
 ) -> None:
-    command = COMMANDS[name]
-    operations = len(logged(command, sources, memory / "whole" / "data"))
+    operations = len(logged(name, sources, memory / "whole" / "data"))
     expected = open_dataset(memory / "whole" / "data")
     stride = max(1, sweep // 4)
     for at in range(FAULTS.index(fault) % stride, operations, stride):
         out = memory / f"{at}" / "data"
-        out.parent.mkdir()
-        status = run_with_fault(command, sources, out, at, fault)
+        begin(name, sources, out)
+        status = run_with_fault(lambda: COMMANDS[name](sources, out), at, fault)  # noqa: B023
         place = f"operation {at} of {operations}"
         assert status == (-9 if fault in ("kill", "torn") else 1), place
-        expect_whole(command, sources, out, expected, place)
+        expect_whole(name, sources, out, expected, place)
         shutil.rmtree(out.parent)
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_power_cut_leaves_no_dataset_or_a_whole_one(
-    sources: list[Path], memory: Path, name: str, sweep: int
+def test_a_power_cut_leaves_the_dataset_before_or_after(
+    sources: Sources, memory: Path, name: str, sweep: int
 ) -> None:
-    command, root = COMMANDS[name], memory / "whole"
-    log = logged(command, sources, root / "data")
-    expected, disk, work = open_dataset(root / "data"), PowerCut(root), memory / "cut"
+    root, work = memory / "whole", memory / "cut"
+    log = logged(name, sources, root / "data")
+    root.rename(memory / "reference")
+    begin(name, sources, root / "data")
+    expected, disk = open_dataset(memory / "reference" / "data"), PowerCut(root)
+    disk.load(root)
     for index, operation in enumerate(log):
         disk.apply(operation)
         if index % max(1, sweep // 4) and index != len(log) - 1:
@@ -121,36 +165,7 @@ def test_a_power_cut_leaves_no_dataset_or_a_whole_one(
             disk.leave(work, loss)
             place = f"after operation {index} of {len(log)}, {loss} lost"
             if (work / "data" / MANIFEST).exists():
-                assert verify_dataset(work / "data").findings == (), place
+                assert all(finding.foreign for finding in verify_dataset(work / "data").findings), place
             else:
                 assert index < len(log) - 1, place
-            expect_whole(command, sources, work / "data", expected, place)
-
-
-CHILD = """
-import sys
-from pathlib import Path
-from tests.test_curation_crashes import COMMANDS
-sources = [Path(name) for name in sys.argv[2:-1]]
-print("ready", flush=True)
-COMMANDS[sys.argv[1]](sources, Path(sys.argv[-1]))
-"""
-
-
-@pytest.mark.sweep
-def test_killed_commands_lose_nothing(sources: list[Path], tmp_path: Path) -> None:
-    dice, kills = random.Random(0), 0
-    for name, command in COMMANDS.items():
-        command(sources, tmp_path / name)
-    while kills < 50:
-        name = dice.choice(list(COMMANDS))
-        out = tmp_path / "killed"
-        arguments = [sys.executable, "-c", CHILD, name, *map(str, sources), str(out)]
-        with subprocess.Popen(arguments, stdout=subprocess.PIPE) as process:
-            assert process.stdout is not None
-            assert process.stdout.readline() == b"ready\n"
-            time.sleep(dice.uniform(0, 0.3))
-            process.send_signal(signal.SIGKILL)
-        kills += process.returncode == -signal.SIGKILL
-        expect_whole(COMMANDS[name], sources, out, open_dataset(tmp_path / name), name)
-        shutil.rmtree(out)
+            expect_whole(name, sources, work / "data", expected, place)

@@ -1,6 +1,5 @@
 """`extend`: further episodes of stored policies, in place and as a new dataset."""
 
-import os
 import shutil
 import signal
 import subprocess
@@ -15,15 +14,10 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import Dataset, extend_dataset, open_dataset, verify_dataset
-from tcmrl_data.build.published import read_published
-from tcmrl_data.curation.appending import append_parts
-from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.errors import BuildError, NondeterminismError, SelectionError
-from tcmrl_data.store import tables
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.platform import _machine
 from tests.commands import assert_refused, in_process
-from tests.simulated_disk import FAULTS, Fault, FaultyDisk
 
 CopyTiny = Callable[[], Path]
 CHEETAH = (
@@ -190,43 +184,7 @@ def test_a_part_in_the_way_is_named_and_a_damaged_one_made_again(tiny_copy: Copy
     assert extend_dataset(folder, episodes=3, tasks=[0], workers=1).root == expected
 
 
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_crash_while_parts_are_appended_leaves_the_old_or_the_new_dataset(
-    fault: Fault, tiny_copy: CopyTiny, tmp_path: Path
-) -> None:
-    folder, old = tiny_copy(), tiny_copy()
-    extend_dataset(folder, episodes=3, tasks=[0], workers=1)
-    extended, before = open_dataset(folder), open_dataset(old)
-    (key,) = set(extended.parts) - set(before.parts)
-    shutil.copytree(folder / "parts/extended", old / "parts/extended")
-    parts = [read_published(extended.file_of(key), key.run)[0]]
-
-    def append(place: Path, disk: publish.Disk) -> None:
-        publish.disk = tables.disk = disk  # type: ignore[attr-defined]
-        append_parts(open_dataset(place), runs=extended.manifest.runs, parts=parts)
-
-    statuses: list[int] = []
-    while not statuses or statuses[-1] != 0:
-        out = tmp_path / f"case-{len(statuses)}"
-        shutil.copytree(old, out)
-        child = os.fork()
-        if not child:
-            status = 1
-            try:
-                append(out, FaultyDisk(len(statuses), fault))
-                status = 0
-            finally:
-                os._exit(status)
-        statuses.append(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-        found = open_dataset(out)
-        assert found.parts.root in (before.manifest.root, extended.manifest.root)
-        if found.manifest.root == before.manifest.root:
-            append_parts(found, runs=extended.manifest.runs, parts=parts)
-        assert open_dataset(out).manifest == extended.manifest
-        assert (out / "parts.jsonl").read_bytes() == (folder / "parts.jsonl").read_bytes()
-    assert len(statuses) > 6
-
-
+@pytest.mark.sweep
 def test_a_killed_extension_goes_on(tiny_copy: CopyTiny) -> None:
     folder, whole = tiny_copy(), tiny_copy()
     arguments = ["--episodes", "3", "--snapshots", "all", "--workers", "1"]

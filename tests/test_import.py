@@ -1,10 +1,6 @@
 """Import: what foreign files hold becomes a dataset that opens, samples, trains and verifies."""
 
 import json
-import os
-import random
-import signal
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -18,14 +14,11 @@ from tcmrl_cli.frame import run
 import tcmrl_algo
 import tcmrl_data
 from tcmrl_data import Dataset, TcmrlError, import_dataset, open_dataset, verify_dataset
-from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.errors import BuildError, SimulationError, SnapshotError, StoreError, TaskError
 from tcmrl_data.interchange.formats.hdf5 import Hdf5Format
-from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.task_table import TASKS as TASK_TABLE
 from tcmrl_data.verification.repair import repair_dataset
 from tests.conftest import TASKS
-from tests.simulated_disk import FAULTS, Fault, FaultyDisk, RecordingDisk
 from tests.test_interchange import assert_equal
 
 ENTRY = '{"index": 0, "split": "train", "parameters": {}}'
@@ -286,58 +279,3 @@ def test_a_stopped_import_goes_on(exported: list[Path], tmp_path: Path) -> None:
         import_dataset("hdf5", exported[:2], out)
     assert import_dataset("hdf5", exported, out).root == whole.root
     assert before.items() <= {path: path.stat().st_mtime_ns for path in out.rglob("*.zip")}.items()
-
-
-def faulty(source: Path, out: Path, at: int, fault: Fault) -> int:
-    """Imports in a forked process whose disk fails at one operation; its exit status."""
-    child = os.fork()
-    if child:
-        return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    status = 3
-    try:
-        publish.disk = FaultyDisk(at, fault)
-        import_dataset("hdf5", [source], out)
-        status = 0
-    except TcmrlError:
-        status = 1
-    finally:
-        os._exit(status)
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_an_import_goes_on_after_a_fault_at_any_operation(
-    fault: Fault, exported: list[Path], tmp_path: Path, sweep: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    recorder = RecordingDisk()
-    with monkeypatch.context() as patch:
-        patch.setattr(publish, "disk", recorder)
-        root = import_dataset("hdf5", exported[:1], tmp_path / "whole").root
-    stride = max(1, sweep // 4)
-    for at in range(FAULTS.index(fault) % stride, len(recorder.log), stride):
-        out = tmp_path / f"{fault}-{at}"
-        status = faulty(exported[0], out, at, fault)
-        assert status == (-signal.SIGKILL if fault in ("kill", "torn") else 1), f"operation {at}: {status}"
-        if not (out / MANIFEST).exists():
-            assert import_dataset("hdf5", exported[:1], out).root == root
-        assert open_dataset(out).manifest.root == root
-        assert verify_dataset(out).findings == (), f"operation {at} of {len(recorder.log)}"
-
-
-@pytest.mark.exhaustive
-def test_an_import_survives_kills(exported: list[Path], tmp_path: Path, sweep: int) -> None:
-    """Killed at random, again and again, an import ends as one that nobody killed."""
-    root = import_dataset("hdf5", exported, tmp_path / "whole").root
-    dice, kills, wanted = random.Random(0), 0, 50 if sweep == 1 else 6
-    while kills < wanted:
-        out = tmp_path / f"killed-{kills}"
-        while not (out / MANIFEST).exists():
-            child = os.fork()
-            if not child:
-                import_dataset("hdf5", exported, out)
-                os._exit(0)
-            if kills < wanted:
-                time.sleep(dice.uniform(0.0, 1.5))
-                os.kill(child, signal.SIGKILL)
-            kills += os.waitpid(child, 0)[1] == signal.SIGKILL
-        assert open_dataset(out).manifest.root == root
-        assert verify_dataset(out).findings == ()

@@ -5,7 +5,6 @@ import re
 import shutil
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,7 +14,7 @@ from tcmrl_data import Dataset, Recipe, open_dataset, verify_dataset
 from tcmrl_data.build.plan import BuildPlan
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, lock_holder, publish_folder, remove_abandoned
-from tcmrl_data.foundation.errors import LockedError, StorageError
+from tcmrl_data.foundation.errors import BuildError, LockedError, StorageError
 from tcmrl_data.store import tables
 from tcmrl_data.store.keys import PARTS, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
@@ -40,18 +39,17 @@ def parts(tiny: Dataset, tiny_recipe: Recipe) -> PreparedParts:
     return PreparedParts(tiny, tiny_recipe, [TASK])
 
 
-@pytest.fixture
-def memory() -> Iterator[Path]:
-    """A folder in memory if the system has one, because thousands of syncs on a disk are slow."""
-    shared = Path("/dev/shm")
-    base = shared if os.access(shared, os.W_OK) else None
-    with tempfile.TemporaryDirectory(dir=base) as folder:
-        yield Path(folder)
-
-
 def figures(text: str) -> None:
     """Prints the counts of a sweep; `pytest -s` shows them."""
     print(text)  # noqa: T201
+
+
+def build(parts: PreparedParts, out: Path) -> None:
+    """Builds; a unit that failed is an error."""
+    with pytest.MonkeyPatch.context() as patch:
+        failed = parts.build(out, patch).failed
+    if failed:
+        raise BuildError(failed[0])
 
 
 def expect_whole(parts: PreparedParts, tiny: Dataset, out: Path) -> None:
@@ -110,7 +108,7 @@ def test_one_more_build_recovers_from_a_fault_at_any_operation(
         out = memory / f"{fault}-{at}" / "data"
         out.parent.mkdir()
         copy_of(half_built, out, start)
-        status = run_with_fault(parts, out, at, fault)
+        status = run_with_fault(lambda: build(parts, out), at, fault)  # noqa: B023
         assert status == (-9 if fault in ("kill", "torn") else 1), f"operation {at} of {operations}: {status}"
         expect_whole(parts, tiny, out)
         shutil.rmtree(out.parent)

@@ -1,7 +1,7 @@
 """Recording: every finished episode survives a crash, and the dataset is the one that no crash would give."""
 
-import os
 import signal
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +10,11 @@ import numpy as np
 import pytest
 from gymnasium.spaces import Box, Discrete
 
-from tcmrl_data import DatasetRecorder, TcmrlError, open_dataset, verify_dataset
+from tcmrl_data import DatasetRecorder, open_dataset, verify_dataset
+from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.errors import LockedError, StoreError
+from tcmrl_data.store.manifest import MANIFEST
+from tests.simulated_disk import FAULTS, Fault, RecordingDisk, run_with_fault
 
 LENGTH, PART = 4, 3
 
@@ -48,6 +51,19 @@ def record(out: Path, episodes: int, **options: Any) -> None:
         play(recorder, episodes)
 
 
+def go_on(out: str | Path, episodes: int, done: Callable[[int], object] = lambda episodes: None) -> int:
+    """Records up to a number of episodes, those of earlier attempts included; returns how many these are."""
+    counter = Counter()
+    with DatasetRecorder(counter, out, part_episodes=PART, horizon=LENGTH) as recorder:
+        first = recorder.episodes
+        counter.number = first - 1
+        done(first)
+        while recorder.episodes < episodes:
+            play(recorder, 1)
+            done(recorder.episodes)
+    return first
+
+
 def test_episodes_become_parts(tmp_path: Path) -> None:
     record(tmp_path / "data", 7, label="counted", parameters={"goal": 1.0})
     found = open_dataset(tmp_path / "data")
@@ -75,23 +91,31 @@ def test_a_reset_truncates_the_open_episode(tmp_path: Path) -> None:
     assert [(len(one), bool(one.truncated[-1])) for one in episodes] == [(2, True)] * 2
 
 
-@pytest.mark.parametrize("finished", range(8))
-def test_a_crash_loses_the_open_episode_alone(finished: int, tmp_path: Path) -> None:
-    record(tmp_path / "whole", 7)
-    out, child = tmp_path / "data", os.fork()
-    if not child:
-        recorder = DatasetRecorder(Counter(), out, part_episodes=PART, horizon=LENGTH)
-        play(recorder, finished)
-        play(recorder, 1, steps=2)
-        os.kill(os.getpid(), signal.SIGKILL)
-    assert os.waitpid(child, 0)[1] == signal.SIGKILL
-    with pytest.raises(TcmrlError):
-        open_dataset(out)
-    with DatasetRecorder(Counter(finished), out, part_episodes=PART, horizon=LENGTH) as recorder:
-        assert recorder.episodes == finished
-        play(recorder, 7 - finished)
-    assert open_dataset(out).manifest.root == open_dataset(tmp_path / "whole").manifest.root
-    assert verify_dataset(out, level="deep").findings == ()
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_at_any_operation_loses_the_open_episode_alone(
+    fault: Fault, memory: Path, sweep: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the process lives on after the fault, it ends the dataset with what it has."""
+    recorder, ends = RecordingDisk(), []
+    with monkeypatch.context() as patch:
+        patch.setattr(publish, "disk", recorder)
+        go_on(memory / "7", 7, lambda episodes: ends.append(len(recorder.log)))
+    stride = max(1, sweep // 2)
+    for at in range(FAULTS.index(fault) % stride, len(recorder.log), stride):
+        out = memory / f"fault at {at}"
+        status = run_with_fault(lambda: go_on(out, 7), at, fault)  # noqa: B023
+        place = f"operation {at} of {len(recorder.log)}"
+        assert status == (-signal.SIGKILL if fault in ("kill", "torn") else 1), place
+        finished = max((number for number, end in enumerate(ends) if end <= at), default=0)
+        if not (out / MANIFEST).exists():
+            assert go_on(out, 7) >= finished, place
+        found = open_dataset(out)
+        kept = sum(found.entry(key).episodes for key in found.parts)
+        assert kept >= finished, place
+        if not (memory / str(kept)).exists():
+            go_on(memory / str(kept), kept)
+        assert found.manifest.root == open_dataset(memory / str(kept)).manifest.root, place
+        assert verify_dataset(out).findings == (), place
 
 
 def test_what_cannot_be_recorded_is_refused(tmp_path: Path) -> None:
