@@ -64,6 +64,7 @@ class Case:
         pause: longest time that it waits then, in seconds.
         has_workers: whether the command starts processes, which are killed too.
         begin: makes what is in the folder before the command.
+        most_kills: of one dataset, which is left to end after a random number of them.
     """
 
     arguments: Callable[[Path], Sequence[object]]
@@ -71,6 +72,7 @@ class Case:
     pause: float
     has_workers: bool = False
     begin: Callable[[Path], object] = lambda out: None
+    most_kills: int = 4
 
 
 def start(case: Case, out: Path, errors: int, mark: str) -> "subprocess.Popen[bytes]":
@@ -180,7 +182,8 @@ def run_sweep(case: Case, kills: int, *, seed: int) -> Figures:
         made = finish_under_fire(case, reference, figures, dice, kills=0)
         while figures.kills < kills:
             case.begin(out)
-            compare(finish_under_fire(case, out, figures, dice, kills=kills), made, figures)
+            wanted = min(kills, figures.kills + dice.randint(1, case.most_kills))
+            compare(finish_under_fire(case, out, figures, dice, kills=wanted), made, figures)
             shutil.rmtree(out)
     return figures
 
@@ -188,7 +191,7 @@ def run_sweep(case: Case, kills: int, *, seed: int) -> Figures:
 def build(arguments: Sequence[str], *, pause: float) -> Case:
     """A build of point-robot-wind; a kill comes at any time."""
     options = ["build", "point-robot-wind", "--profile", "quick", "--workers", "2", *arguments]
-    return Case(lambda out: [*options, "--out", out], 0, pause, has_workers=True)
+    return Case(lambda out: [*options, "--out", out], 0, pause, has_workers=True, most_kills=40)
 
 
 def main() -> None:
