@@ -214,7 +214,8 @@ def test_no_trajectory_is_a_context_where_the_method_needs_none(name: str) -> No
 @every
 def test_exploration_is_uniform_unless_the_method_says_otherwise(name: str) -> None:
     made = Made(name)
-    collectors = [made.algorithm.explore(lanes) for lanes in ([[], []], LANES)]
+    last = [[trajectory(4, lane)] * (made.settings.run.random_episodes - 1) for lane in range(2)]
+    collectors = [made.algorithm.explore(lanes) for lanes in ([[], []], last)]
     own = not all(isinstance(collector, UniformController) for collector in collectors)
     assert own is made.method.capabilities.explores
     assert {act(collector).shape for collector in collectors} == {(2, ACTION_DIM)}
