@@ -68,7 +68,7 @@ class Perceptron(nn.Module):
             for layer in self.layers[:-1]:
                 rows = self._activation(layer(rows))
         outputs: Tensor = self.layers[-1](rows.to(inputs.dtype))
-        return outputs.view(*inputs.shape[:-1], -1)
+        return outputs.view(*inputs.shape[:-1], outputs.shape[-1])
 
 
 def set_hidden_dtype(module: nn.Module, dtype: torch.dtype) -> None:
