@@ -88,7 +88,8 @@ def test_literal_variances_are_squashed_and_free_ones_are_not() -> None:
 
 
 def test_it_collects_uniformly_at_first_and_then_by_what_it_collected() -> None:
-    half, made = RunSettings().random_episodes // 2, algorithm_of("csro", SMALL | {"random_share": 0.5})
+    made = algorithm_of("csro", SMALL | {"random_share": 0.5})
+    half = (RunSettings().random_episodes + 1) // 2
     lanes = [[trajectory(6, lane)] * half for lane in range(2)]
     for collected in ([[], []], [lane[1:] for lane in lanes]):
         assert isinstance(made.explore(collected), UniformController)
