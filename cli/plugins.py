@@ -43,6 +43,7 @@ ALL_PROTOCOLS = "all"
 
 BEHAVIOR = PluginName("tcmrl.behavior", "behavior source")
 ENGINE = PluginName("tcmrl.engines", "engine")
+PROTOCOL_NAME = PluginName("tcmrl.protocols", "protocol")
 PROTOCOL = PluginName("tcmrl.protocols", "protocol", others=[ALL_PROTOCOLS])
 FORMAT = PluginName("tcmrl.formats", "format")
 READER = PluginName("tcmrl.readers", "import format")

@@ -23,6 +23,7 @@ from .plugins import ALGORITHM
 from .progress import StageProgress
 from .reports import report
 from .runs import runs
+from .tuning import tune
 
 if TYPE_CHECKING:
     from tcmrl_algo import TrainingConfig, TrainingProgress, TrainingReport
@@ -44,6 +45,7 @@ def tcmrl() -> None:
       tcmrl-data build point-robot --profile quick
       tcmrl train data/point-robot
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all
+      tcmrl tune data/point-robot --algo focal --trials 16
       tcmrl experiment figure5 --workers 2
       tcmrl report results/figure5
 
@@ -55,6 +57,7 @@ tcmrl.add_command(evaluate)
 tcmrl.add_command(experiment)
 tcmrl.add_command(report)
 tcmrl.add_command(runs)
+tcmrl.add_command(tune)
 
 
 @tcmrl.command()

@@ -28,6 +28,8 @@ from .methods.network_algorithm import FunctionController as FunctionController
 from .methods.network_algorithm import NetworkAlgorithm as NetworkAlgorithm
 from .methods.padding import pad_trajectories as pad_trajectories
 from .methods.problem import Problem as Problem
+from .methods.search import Factors as Factors
+from .methods.search import Options as Options
 from .methods.stages import Stage as Stage
 from .methods.stages import StagedOptimizer as StagedOptimizer
 from .methods.stages import StagePlan as StagePlan
@@ -46,3 +48,9 @@ from .training.train import TrainingReport as TrainingReport
 from .training.train import create_algorithm as create_algorithm
 from .training.train import resume_run as resume_run
 from .training.train import train_run as train_run
+from .tuning.record import Trial as Trial
+from .tuning.record import Tuning as Tuning
+from .tuning.record import read_tuning as read_tuning
+from .tuning.tune import EndedTrial as EndedTrial
+from .tuning.tune import TuningReport as TuningReport
+from .tuning.tune import tune_method as tune_method

@@ -39,6 +39,7 @@ from .envs.recorder import Recorder as Recorder
 from .envs.rollout import roll_out as roll_out
 from .envs.tasks import Task as Task
 from .envs.tasks import draw_tasks as draw_tasks
+from .envs.tasks import in_order as in_order
 from .envs.trajectory import Trajectory as Trajectory
 from .foundation.canonical import canonical_json as canonical_json
 from .foundation.canonical import parse_json as parse_json

@@ -61,4 +61,5 @@ def test_purposes_keep_their_numbers() -> None:
         "EXTENSION_NOISE": 16,
         "EVALUATION_CANDIDATES": 17,
         "CONTROL_RESET": 18,
+        "TUNING": 19,
     }

@@ -1,6 +1,6 @@
 """TCMRL: a task characteristic extractor trained by reward estimation, and a task contrastive loss."""
 
-from typing import Literal, final
+from typing import ClassVar, Literal, final
 
 import torch
 from jaxtyping import Bool, Float
@@ -12,6 +12,7 @@ from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner,
 from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig, Metrics
 from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.search import ACTOR_CRITIC_SEARCH, Options, Search
 from tcmrl_algo.networks.attention import Attention, TaskExtractor, uniform_attention
 from tcmrl_algo.networks.perceptron import call_frozen
 from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
@@ -24,6 +25,9 @@ SPARSITY = {
     "entropy": losses.entropy_sparsity_loss,
 }
 """Readings of Eq. 6 that are functions of the scores."""
+
+TRIED_WEIGHTS = Options((0.0, 0.01, 0.1, 1.0))
+"""Of loss terms, beside a weight of 1 for `positive`."""
 
 ESTIMATOR_WEIGHT = 1.0
 """Of the term `estimator`, the only one that then trains the estimator; Adam is indifferent to its scale."""
@@ -242,6 +246,14 @@ class Tcmrl(Method[TcmrlConfig]):
 
     name = "tcmrl"
     Config = TcmrlConfig
+    search: ClassVar[Search] = {
+        **ACTOR_CRITIC_SEARCH,
+        "tcmrl.weights.negative": TRIED_WEIGHTS,
+        "tcmrl.weights.sparsity": TRIED_WEIGHTS,
+        "tcmrl.weights.contrastive": TRIED_WEIGHTS,
+        "tcmrl.weights.distance": TRIED_WEIGHTS,
+        "tcmrl.reward_estimation": Options(("auto", "transition")),
+    }
 
     def batch_request(self, settings: TrainingSettings, config: TcmrlConfig) -> BatchRequest:
         """The `[training.batch]` table as it is."""

@@ -9,6 +9,7 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.search import OPTIMIZER_SEARCH, Search
 from tcmrl_algo.methods.stages import Stage
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Controller, Trajectory, UniformController
@@ -108,6 +109,7 @@ class Method(abc.ABC, Generic[ConfigT]):
         name: as `--algo` and a recipe's `[training.<name>]` table spell it.
         Config: the method's own settings; its docstring documents every field.
         capabilities: what evaluation may expect.
+        search: the settings that `tcmrl tune` searches, by their place in the training table.
 
     Example:
         >>> METHODS.get("focal").name
@@ -117,6 +119,7 @@ class Method(abc.ABC, Generic[ConfigT]):
     name: ClassVar[str]
     Config: ClassVar[type[MethodConfig]] = MethodConfig
     capabilities: ClassVar[Capabilities] = Capabilities()
+    search: ClassVar[Search] = OPTIMIZER_SEARCH
 
     @abc.abstractmethod
     def batch_request(self, settings: TrainingSettings, config: ConfigT) -> BatchRequest:

@@ -21,6 +21,7 @@ from tcmrl_algo.training.interruption import DeferredInterrupts
 from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_algo.training.metrics import MetricsWriter
 from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError
+from tcmrl_data.foundation.errors import DivergenceError
 
 PACKAGES = ("torch", "numpy")
 """Whose versions results depend on."""
@@ -110,7 +111,8 @@ def train_run(
     Raises:
         CheckpointError: the folder holds a run already.
         SelectionError: fewer than two training tasks, or too few snapshots or trajectories.
-        TrainingError: an unusable device, or a loss that is not finite.
+        TrainingError: an unusable device.
+        DivergenceError: a loss that is not finite, or beyond the method's limits.
 
     Example:
         >>> dataset = tcmrl_data.open_dataset("data/point-robot")  # doctest: +SKIP
@@ -173,7 +175,8 @@ def resume_run(
 
     Raises:
         CheckpointError: no run, another dataset, or already further than `steps`.
-        TrainingError: an unusable device, or a loss that is not finite.
+        TrainingError: an unusable device.
+        DivergenceError: a loss that is not finite, or beyond the method's limits.
     """
     run = open_run(out)
     run.check_dataset(dataset)
@@ -282,24 +285,24 @@ def _check_sizes(metrics: Mapping[str, Tensor], limits: Mapping[str, float], ste
     """Stops training where a metric is NaN or beyond its limit, one synchronisation for all of them.
 
     Raises:
-        TrainingError: with the first such metric, its value, its limit and the step.
+        DivergenceError: with the first such metric, its value, its limit and the step.
     """
     largest = [limits.get(name, sys.float_info.max) for name in metrics]
     sizes = torch.stack([value.double().abs() for value in metrics.values()]).tolist()
     for name, size, limit in zip(metrics, sizes, largest, strict=True):
         if math.isnan(size) or size > limit:
             what = f"is {size:.3g}, beyond {limit:.3g}," if name in limits else "is not finite"
-            raise TrainingError(f"{name} {what} at step {step}; {REMEDY}")
+            raise DivergenceError(f"{name} {what} at step {step}; {REMEDY}")
 
 
 def _check_finite(values: Mapping[str, Tensor], step: int) -> None:
     """Stops training where a tensor holds NaN or infinity, one synchronisation for all of them.
 
     Raises:
-        TrainingError: with the first such quantity and the step.
+        DivergenceError: with the first such quantity and the step.
     """
     bad = [torch.isfinite(value).all() for value in values.values()]
     if bool(torch.stack(bad).all()):
         return
     name = next(name for name, finite in zip(values, bad, strict=True) if not finite)
-    raise TrainingError(f"{name} is not finite at step {step}; {REMEDY}")
+    raise DivergenceError(f"{name} is not finite at step {step}; {REMEDY}")

@@ -91,3 +91,7 @@ class CheckpointError(TcmrlError):
 
 class TrainingError(TcmrlError):
     """A training run that cannot start, or that diverged."""
+
+
+class DivergenceError(TrainingError):
+    """A training run whose losses or tensors are not finite, or beyond a method's limits."""

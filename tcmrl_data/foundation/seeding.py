@@ -31,6 +31,7 @@ class Purpose(enum.IntEnum):
     EXTENSION_NOISE = 16
     EVALUATION_CANDIDATES = 17
     CONTROL_RESET = 18
+    TUNING = 19
 
 
 def environment_key(environment: str) -> int:
