@@ -19,7 +19,6 @@ import gc
 import json
 import os
 import platform
-import resource
 import statistics
 import subprocess
 import sys
@@ -35,6 +34,7 @@ import numpy as np
 import torch
 from _generated import generate_dataset
 from _peers import Data, Draw, Work
+from _timing import memory
 from numcodecs.zstd import Zstd
 
 import tcmrl_data
@@ -85,7 +85,7 @@ def measure(folder: Path, repeats: int) -> dict[str, Any]:
     os.sched_setaffinity(0, {core})
     torch.set_num_threads(1)
     opening = _opening(folder, repeats)
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024  # before any peer is loaded
+    peak = memory("VmHWM")  # before any peer is loaded
     dataset = tcmrl_data.open_dataset(folder)
     settings = dataset.environment.settings
     work = Work(tasks=16, transitions=256, windows=512, window_length=10, horizon=settings.horizon)

@@ -10,13 +10,13 @@ import argparse
 import itertools
 import json
 import os
-import resource
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
+from _timing import memory
 from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
@@ -257,7 +257,7 @@ def main() -> None:
             for name, cases in GROWTH.items()
         },
         "components_milliseconds": {name: components(sizes, **how) for name, sizes in CASES.items()},
-        "peak_memory_megabytes": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "peak_memory_megabytes": memory("VmHWM") / 2**20,
     }
     print(json.dumps(document, indent=1))
 
