@@ -3,6 +3,7 @@
 import contextlib
 import io
 import json
+import os
 import shlex
 import signal
 import sys
@@ -15,6 +16,7 @@ import click
 
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.torch_compiler import leave_out_compiler
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -44,6 +46,7 @@ def main_program(command: click.Command) -> NoReturn:
 
     Further signals are ignored, because they would interrupt the cleanup.
     """
+    leave_out_compiler()
     obeyed = False
 
     def interrupt(number: int, frame: FrameType | None) -> None:
@@ -145,8 +148,8 @@ def output_options(command: Command) -> Command:
 
 
 def print_json(document: Any) -> None:
-    """Prints one JSON document on standard output."""
-    click.echo(json.dumps(document, indent=2, allow_nan=False))
+    """Prints one JSON document on standard output; paths become text."""
+    click.echo(json.dumps(document, indent=2, allow_nan=False, default=os.fspath))
 
 
 def print_table(table: "Table") -> None:

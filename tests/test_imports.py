@@ -84,6 +84,31 @@ def test_roots_load_nothing_until_asked_and_keep_what_they_promise(package: obje
         _ = root.nothing
 
 
+@pytest.mark.sweep
+def test_a_worker_loads_torchs_compiler_only_if_it_compiles() -> None:
+    code = (
+        "import torch\n"
+        "from tcmrl_data.engine.worker import serve\n"
+        "def work(spec, report):\n"
+        "    parameter = torch.nn.Parameter(torch.ones(2))\n"
+        "    optimizer = torch.optim.Adam([parameter])\n"
+        "    parameter.sum().backward()\n"
+        "    optimizer.step()\n"
+        "    is_left_out = 'torch._dynamo.config' not in sys.modules\n"
+        "    doubled = torch.compile(lambda tensor: 2 * tensor, backend='eager')(torch.ones(2))\n"
+        "    return f'{is_left_out} {doubled.tolist()}'\n"
+        "import sys\n"
+        "serve(work)\n"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as worker:
+        assert worker.stdin and worker.stdout
+        worker.stdin.write("{}\n")
+        worker.stdin.flush()
+        assert json.loads(worker.stdout.read())["digest"] == "True [2.0, 2.0]"
+
+
 @pytest.mark.parametrize("room", ["losses", "networks"])
 def test_equations_and_networks_import_torch_and_shapes_only(room: str) -> None:
     imported = set()

@@ -17,6 +17,7 @@ from types import FrameType
 from typing import Any
 
 from tcmrl_data.foundation.errors import TcmrlError
+from tcmrl_data.foundation.torch_compiler import leave_out_compiler
 
 REPORT_SECONDS = 0.5
 
@@ -68,6 +69,7 @@ def serve(work: Callable[[dict[str, Any], Send], str]) -> None:
             that it raises becomes the unit's error; the unit is not tried again.
     """
     signal.signal(signal.SIGTERM, _abandon)
+    leave_out_compiler()
     spec = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
     report = _Reporter()
