@@ -211,7 +211,7 @@ def build(
             progress=lambda event: _show(event, progress),
         )
     if as_json:
-        print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
+        print_json(dataclasses.asdict(report))
     else:
         click.echo(
             f"{report.dataset}: {report.built:,} parts built, {report.present:,} already present, "

@@ -1,9 +1,8 @@
 """`tcmrl-data derive`, `merge`, `split`, `rename` and `delete`."""
 
 import dataclasses
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING
 
 import click
 
@@ -11,14 +10,11 @@ from tcmrl_data.foundation.errors import TierError
 from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.sizes import size
 
-from .frame import fail_incomplete, output_options, print_json, remark, same_command, stopped_by_signals
-from .progress import StageProgress
+from .frame import fail_incomplete, output_options, print_json, remark
+from .progress import PartsProgress, with_progress
 
 if TYPE_CHECKING:
     from tcmrl_data import Derived
-
-Made = TypeVar("Made")
-Progress = Callable[[int, int], None]
 
 TIERS = ("random", "medium", "medium-replay", "expert", "medium-expert", "random-expert", "mixed")
 SOURCE = click.argument("dataset", type=click.Path(path_type=Path))
@@ -105,7 +101,7 @@ def derive(
     import tcmrl_data
     from tcmrl_data.curation.derive import describe_far
 
-    def make(progress: Progress) -> "Derived":
+    def make(progress: PartsProgress) -> "Derived":
         return tcmrl_data.derive_dataset(
             dataset,
             out,
@@ -127,7 +123,7 @@ def derive(
         )
 
     try:
-        made = _run(make, out or Path(), "derive", quiet=quiet)
+        made = with_progress(make, stage="derive", out=out or Path(), quiet=quiet)
     except TierError as error:
         fail_incomplete(f"{error}; choose another tier, or a larger --tolerance")
         return
@@ -185,7 +181,7 @@ def merge(
     """
     import tcmrl_data
 
-    def make(progress: Progress) -> "Derived":
+    def make(progress: PartsProgress) -> "Derived":
         return tcmrl_data.merge_datasets(
             datasets,
             out,
@@ -196,7 +192,7 @@ def merge(
             progress=progress,
         )
 
-    made = _run(make, out, "merge", quiet=quiet)
+    made = with_progress(make, stage="merge", out=out, quiet=quiet)
     _print([made], as_json=as_json, dry_run=dry_run)
 
 
@@ -239,7 +235,7 @@ def split(
     if numbers is not None and not all(number.isdecimal() for number in numbers):
         raise click.UsageError(f"--episodes {episodes}: expected numbers such as 45,5.")
 
-    def make(progress: Progress) -> "list[Derived]":
+    def make(progress: PartsProgress) -> "list[Derived]":
         return tcmrl_data.split_dataset(
             dataset,
             out,
@@ -252,7 +248,8 @@ def split(
             progress=progress,
         )
 
-    _print(_run(make, out, "split", quiet=quiet), as_json=as_json, dry_run=dry_run)
+    made = with_progress(make, stage="split", out=out, quiet=quiet)
+    _print(made, as_json=as_json, dry_run=dry_run)
 
 
 @click.command()
@@ -302,23 +299,17 @@ def delete(dataset: Path, yes: bool, dry_run: bool, as_json: bool, quiet: bool) 
             click.confirm(f"Delete {printable(str(dataset))}, {what}?", abort=True, err=True)
         found = tcmrl_data.delete_dataset(dataset)
     if as_json:
-        print_json(dataclasses.asdict(found) | {"dataset": str(found.dataset), "dry_run": dry_run})
+        print_json(dataclasses.asdict(found) | {"dry_run": dry_run})
         return
     for file in found.kept:
         click.echo(f"{printable(file)}: {'would be ' if dry_run else ''}kept, it is no part of a dataset")
     click.echo(f"{printable(str(found.dataset))}: {what} {'would be ' if dry_run else ''}deleted")
 
 
-def _run(make: Callable[[Progress], Made], out: Path, stage: str, *, quiet: bool) -> Made:
-    """Calls a function of the package with progress; Ctrl-C says how to go on."""
-    with stopped_by_signals(lambda: same_command(out)), StageProgress(quiet=quiet) as progress:
-        return make(lambda done, total: progress.update(stage, done=done, total=total, unit="parts"))
-
-
 def _print(datasets: "list[Derived]", *, as_json: bool, dry_run: bool) -> None:
     """Prints what was made, or would be."""
     if as_json:
-        rows = [dataclasses.asdict(made) | {"out": str(made.out)} for made in datasets]
+        rows = list(map(dataclasses.asdict, datasets))
         print_json({"dry_run": dry_run, "datasets": rows})
         return
     for made in datasets:

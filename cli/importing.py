@@ -6,9 +6,9 @@ from typing import Any
 
 import click
 
-from .frame import output_options, print_json, remark, same_command, stopped_by_signals
+from .frame import output_options, print_json, remark
 from .plugins import READER
-from .progress import StageProgress
+from .progress import with_progress
 
 
 @click.command(name="import")
@@ -71,8 +71,8 @@ def import_data(
     """
     import tcmrl_data
 
-    with stopped_by_signals(lambda: same_command(out)), StageProgress(quiet=quiet) as progress:
-        report = tcmrl_data.import_dataset(
+    report = with_progress(
+        lambda progress: tcmrl_data.import_dataset(
             format_name,
             files,
             out,
@@ -84,10 +84,14 @@ def import_data(
             licence=licence,
             url=url,
             dry_run=dry_run,
-            progress=lambda done, total: progress.update("import", done=done, total=total, unit="parts"),
-        )
+            progress=progress,
+        ),
+        stage="import",
+        out=out,
+        quiet=quiet,
+    )
     if as_json:
-        print_json(dataclasses.asdict(report) | {"out": str(out)})
+        print_json(dataclasses.asdict(report) | {"out": out})
         return
     for note in report.notes:
         remark(note, quiet=quiet)

@@ -2,15 +2,21 @@
 
 import sys
 import time
+from collections.abc import Callable
+from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import click
 
-from .frame import duration
+from .frame import duration, same_command, stopped_by_signals
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+
+Made = TypeVar("Made")
+PartsProgress = Callable[[int, int], None]
+"""Takes the number of parts that are done, and of all."""
 
 PLAIN_SECONDS = 5.0
 """Least time between two plain lines of a stage."""
@@ -130,6 +136,12 @@ class StageProgress:
         detail = f", {words['detail']}" if words["detail"] else ""
         left = f", {words['left']} left" if words["left"] else ""
         click.echo(f"{stage}: {done:,.0f} of {total:,.0f} {unit}{rate}{detail}{left}", err=True)
+
+
+def with_progress(work: Callable[[PartsProgress], Made], *, stage: str, out: Path, quiet: bool) -> Made:
+    """Calls a function that reports its progress; Ctrl-C says what is kept in `out` and how to go on."""
+    with stopped_by_signals(lambda: same_command(out)), StageProgress(quiet=quiet) as progress:
+        return work(lambda done, total: progress.update(stage, done=done, total=total, unit="parts"))
 
 
 def _rate(rate: float) -> str:

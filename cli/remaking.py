@@ -7,8 +7,8 @@ import click
 
 from tcmrl_data.foundation.plain_files import printable
 
-from .frame import output_options, print_json, same_command, stopped_by_signals
-from .progress import StageProgress
+from .frame import output_options, print_json
+from .progress import with_progress
 
 DATASET = click.argument("dataset", type=click.Path(path_type=Path))
 
@@ -86,8 +86,8 @@ def extend(
     limit = opened.manifest.recipe.environment.tasks
     chosen = None if tasks is None else tcmrl_data.parse_indices(tasks, limit)
     target = opened.folder if out is None else out
-    with stopped_by_signals(lambda: same_command(target)), StageProgress(quiet=quiet) as progress:
-        report = tcmrl_data.extend_dataset(
+    report = with_progress(
+        lambda progress: tcmrl_data.extend_dataset(
             dataset,
             episodes=episodes,
             out=out,
@@ -101,10 +101,14 @@ def extend(
             allow_drift=allow_drift,
             workers=workers,
             dry_run=dry_run,
-            progress=lambda done, total: progress.update("extend", done=done, total=total, unit="parts"),
-        )
+            progress=progress,
+        ),
+        stage="extend",
+        out=target,
+        quiet=quiet,
+    )
     if as_json:
-        print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
+        print_json(dataclasses.asdict(report))
         return
     parts = f"{report.made:,} part{'' if report.made == 1 else 's'} of {report.episodes:,} episodes"
     end = "would be made" if report.root is None else f"made, {report.present:,} already there"
@@ -171,8 +175,8 @@ def relabel(
         return tcmrl_data.parse_indices(text, limit, option=option)
 
     targets = to if to == "all" or to.startswith("nearest") else parse(to, "--to")
-    with stopped_by_signals(lambda: same_command(out)), StageProgress(quiet=quiet) as progress:
-        report = tcmrl_data.relabel_dataset(
+    report = with_progress(
+        lambda progress: tcmrl_data.relabel_dataset(
             dataset,
             out,
             to=targets,
@@ -184,10 +188,14 @@ def relabel(
             label=label,
             workers=workers,
             dry_run=dry_run,
-            progress=lambda done, total: progress.update("relabel", done=done, total=total, unit="parts"),
-        )
+            progress=progress,
+        ),
+        stage="relabel",
+        out=out,
+        quiet=quiet,
+    )
     if as_json:
-        print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
+        print_json(dataclasses.asdict(report))
         return
     counts = f"{report.parts:,} parts with {report.steps:,} steps of {report.pairs:,} pairs of tasks"
     end = " would be made" if report.root is None else f"; root {report.root[:12]}"

@@ -78,7 +78,7 @@ def verify(
             progress=lambda done, total: progress.update("verify", done=done, total=total, unit="parts"),
         )
     if as_json:
-        print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
+        print_json(dataclasses.asdict(report))
     else:
         for finding in report.findings:
             click.echo(f"{printable(finding.file)}: {printable(finding.problem)}")
@@ -128,7 +128,7 @@ def repair(dataset: Path, as_json: bool, quiet: bool, deep: bool, workers: int |
             progress=lambda event: _show(event, progress),
         )
     if as_json:
-        print_json(dataclasses.asdict(report) | {"dataset": str(report.dataset)})
+        print_json(dataclasses.asdict(report))
     else:
         for key in report.repaired:
             click.echo(f"{key}: regenerated, same id")
