@@ -39,7 +39,6 @@ from tcmrl_data.store.tables import read_lines
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import repair as repair_module
 from tcmrl_data.verification import replay as replay_module
-from tcmrl_data.verification import tables as tables_module
 from tcmrl_data.verification.garbage import collect_garbage
 from tests.forged_datasets import PART, STEP, Forge, base
 
@@ -378,7 +377,7 @@ def test_a_repair_killed_between_tables_and_manifest_is_finished_by_the_next(
 
     rot(folder / PARTS_TABLE)
     with monkeypatch.context() as patch:
-        patch.setattr(tables_module, "replace_file", replace_some)
+        patch.setattr(sealing, "replace_file", replace_some)
         with pytest.raises(KeyboardInterrupt):
             repair_dataset(folder)
     assert replaced == [TASKS, PARTS_TABLE][:num_files]

@@ -23,7 +23,7 @@ from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_file, part_folder
 from tcmrl_data.store.limits import MAX_PLATFORMS
-from tcmrl_data.store.manifest import MANIFEST, MANIFEST_SCHEMA, Run, Totals, read_manifest, seal
+from tcmrl_data.store.manifest import MANIFEST, Run, read_manifest
 from tcmrl_data.store.part_record import DATA_VERSION
 from tcmrl_data.store.part_table import (
     HEADER,
@@ -34,7 +34,7 @@ from tcmrl_data.store.part_table import (
     parse_parts,
     part_line,
 )
-from tcmrl_data.store.sealing import is_complete
+from tcmrl_data.store.sealing import manifest_bytes
 from tcmrl_data.store.tables import TableWriter, read_log, read_sealed
 from tcmrl_data.store.task_table import TASKS, parse_tasks, task_line
 
@@ -203,31 +203,21 @@ class Ledger:
 
     def _manifest(self) -> bytes:
         """The manifest of what is there."""
-        plan, earlier, table = self.plan, self._earlier, self._kept_parts()
+        plan, earlier = self.plan, self._earlier
         main = Run(name=MAIN_RUN, kind="built", seed=plan.seed, recipe=plan.recipe, steps=plan.source.steps)
         runs = [main, *(earlier.runs[1:] if earlier else ())]
-        totals = Totals(
-            parts=len(table),
-            episodes=table.total("episodes"),
-            steps=table.total("steps"),
-            bytes=table.total("size"),
+        return manifest_bytes(
+            name=plan.environment.name,
+            label=earlier.label if earlier else None,
+            data_version=DATA_VERSION,
+            runs=runs,
+            derivation=None,
+            platforms=self.platforms,
+            tasks=self._task_writer.seal,
+            parts=self._part_writer.seal,
+            dropped=plan.dropped,
+            kept=self._kept_parts(),
         )
-        fields = {
-            "schema_version": MANIFEST_SCHEMA,
-            "name": plan.environment.name,
-            "label": earlier.label if earlier else None,
-            "data_version": DATA_VERSION,
-            "runs": [run.model_dump(mode="json") for run in runs],
-            "derivation": None,
-            "platforms": [platform.model_dump(mode="json") for platform in self.platforms],
-            "tasks": self._task_writer.seal.model_dump(),
-            "parts": self._part_writer.seal.model_dump(),
-            "dropped": sorted(plan.dropped),
-            "totals": totals.model_dump(),
-            "root": table.root,
-            "complete": is_complete(table, runs, num_tasks=len(self._steps)),
-        }
-        return seal(fields)
 
     def _record(self, published: Published) -> None:
         """Appends a part's line to the table."""

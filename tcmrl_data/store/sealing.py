@@ -11,6 +11,7 @@ from tcmrl_data.store.manifest import (
     Derivation,
     Manifest,
     Run,
+    TableSeal,
     Totals,
     read_manifest,
     seal,
@@ -65,7 +66,51 @@ def write_dataset(
         TASKS: b"".join(task_line(task) for task in sorted(tasks, key=lambda task: task.index)),
         PARTS_TABLE: HEADER + b"".join(map(part_line, table.entries())),
     }
-    kept = table.without_tasks(dropped)
+    for file, data in tables.items():
+        replace_file(folder / file, data, staging=folder / STAGING)
+    sealed = manifest_bytes(
+        name=name,
+        label=label,
+        data_version=data_version,
+        runs=runs,
+        derivation=derivation,
+        platforms=platforms,
+        tasks=seal_of(tables[TASKS]),
+        parts=seal_of(tables[PARTS_TABLE]),
+        dropped=dropped,
+        kept=table.without_tasks(dropped),
+    )
+    replace_file(folder / MANIFEST, sealed, staging=folder / STAGING)
+    return read_manifest(folder)
+
+
+def manifest_bytes(
+    *,
+    name: str,
+    label: str | None,
+    data_version: int,
+    runs: Sequence[Run],
+    derivation: Derivation | None,
+    platforms: Sequence[Platform],
+    tasks: TableSeal,
+    parts: TableSeal,
+    dropped: Collection[int],
+    kept: PartTable,
+) -> bytes:
+    """The file of a manifest.
+
+    Args:
+        name: the environment's name.
+        label: the dataset's own name.
+        data_version: of the parts.
+        runs: how the parts were made.
+        derivation: how the dataset was derived from others.
+        platforms: of the parts.
+        tasks: seal of the table of all tasks, dropped ones too.
+        parts: seal of the table of all parts.
+        dropped: indices of tasks that do not belong to the dataset.
+        kept: the parts of the other tasks.
+    """
     fields = {
         "schema_version": MANIFEST_SCHEMA,
         "name": name,
@@ -74,17 +119,14 @@ def write_dataset(
         "runs": [run.model_dump(mode="json") for run in runs],
         "derivation": None if derivation is None else derivation.model_dump(mode="json"),
         "platforms": [platform.model_dump(mode="json") for platform in platforms],
-        "tasks": seal_of(tables[TASKS]).model_dump(),
-        "parts": seal_of(tables[PARTS_TABLE]).model_dump(),
+        "tasks": tasks.model_dump(),
+        "parts": parts.model_dump(),
         "dropped": sorted(dropped),
         "totals": totals_of(kept).model_dump(),
         "root": kept.root,
-        "complete": is_complete(kept, runs, num_tasks=len(tasks) - len(dropped)),
+        "complete": is_complete(kept, runs, num_tasks=tasks.lines - len(dropped)),
     }
-    for file, data in tables.items():
-        replace_file(folder / file, data, staging=folder / STAGING)
-    replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
-    return read_manifest(folder)
+    return seal(fields)
 
 
 def is_complete(table: PartTable, runs: Sequence[Run], *, num_tasks: int) -> bool:

@@ -8,23 +8,16 @@ from pathlib import Path
 
 from tcmrl_data.build.published import Published, numbered, read_published
 from tcmrl_data.envs.tasks import Task, draw_tasks
-from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.keys import PartKey, key_of_file, part_file
-from tcmrl_data.store.manifest import MANIFEST, Manifest, seal
-from tcmrl_data.store.part_table import (
-    HEADER,
-    PARTS_TABLE,
-    PartTable,
-    parse_entries,
-    parse_parts,
-    part_line,
-)
+from tcmrl_data.store.manifest import MANIFEST, Manifest
+from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_entries, parse_parts
 from tcmrl_data.store.platform import Platform
-from tcmrl_data.store.tables import read_lines, read_sealed, seal_of
-from tcmrl_data.store.task_table import TASKS, parse_tasks, task_line
+from tcmrl_data.store.sealing import write_dataset
+from tcmrl_data.store.tables import read_lines, read_sealed
+from tcmrl_data.store.task_table import TASKS, parse_tasks
 from tcmrl_data.verification.contents import recipe_environment
 from tcmrl_data.verification.scan import scan_dataset
 
@@ -65,25 +58,22 @@ def write_tables(
 
     If this is interrupted the tables are not those of the manifest, and `restore_tables` finds them again.
     """
-    tables = {
-        TASKS: b"".join(map(task_line, tasks)),
-        PARTS_TABLE: HEADER + b"".join(map(part_line, table.entries())),
-    }
-    for name, data in tables.items():
-        replace_file(folder / name, data, staging=folder / STAGING)
-    fields = manifest.model_dump(mode="json", exclude={"digest"})
-    fields |= {"platforms": [platform.model_dump(mode="json") for platform in platforms]}
-    fields |= {
-        "tasks": seal_of(tables[TASKS]).model_dump(),
-        "parts": seal_of(tables[PARTS_TABLE]).model_dump(),
-    }
-    kept = table.without_tasks(manifest.dropped)
-    fields["totals"]["bytes"] = kept.total("size")
-    replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
+    write_dataset(
+        folder,
+        name=manifest.name,
+        label=manifest.label,
+        data_version=manifest.data_version,
+        runs=manifest.runs,
+        derivation=manifest.derivation,
+        platforms=platforms,
+        tasks=tasks,
+        dropped=manifest.dropped,
+        table=table,
+    )
 
 
 def _recover_parts(folder: Path, manifest: Manifest, platforms: list[Platform]) -> PartTable:
-    """The table that has the manifest's root, of sound parts and of sound lines; any if none has it.
+    """The table that has the manifest's root, of sound parts and of sound lines; the last if none has it.
 
     A damaged part stands in its line alone. A sound part without a line may not be recorded yet.
     """
@@ -99,9 +89,11 @@ def _recover_parts(folder: Path, manifest: Manifest, platforms: list[Platform]) 
     }
     in_lines = {key: sound.get(key, entry) for key, entry in recorded.items()}
     choices = (recorded | sound, in_lines, sound)
-    tables = [PartTable.empty().with_entries(list(entries.values())) for entries in choices]
-    fitting = (table for table in tables if table.without_tasks(manifest.dropped).root == manifest.root)
-    return next(fitting, tables[0])
+    for entries in choices:
+        table = PartTable.empty().with_entries(list(entries.values()))
+        if table.without_tasks(manifest.dropped).root == manifest.root:
+            break
+    return table
 
 
 def _read_parts(folder: Path) -> list[Published]:
