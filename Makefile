@@ -10,9 +10,13 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 INSTALLED_TEST := $(VENV)/.installed-test
+# The tests of a file stay together, so that its fixtures are made once.
+SPREAD := -n $(JOBS) --dist worksteal
 
 export MUJOCO_GL ?= disabled
 export MPLBACKEND ?= Agg
+# Hundreds of processes would compile the packages again.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo test check format clean
 
@@ -38,14 +42,14 @@ demo: $(INSTALLED)
 	@echo "Next: $(BIN)/tcmrl experiment tour --data $(DATA)"
 
 test: $(INSTALLED_TEST)
-	$(BIN)/python -m pytest -n $(JOBS) -m "not sweep"
+	$(BIN)/python -m pytest $(SPREAD) -m "not sweep"
 
 check: $(INSTALLED_TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -n $(JOBS)
+	$(BIN)/python -m pytest $(SPREAD)
 
 format: $(INSTALLED_TEST)
 	$(BIN)/ruff check --fix .

@@ -1,5 +1,7 @@
 """Shared fixtures: one real, tiny dataset, built once per session with the real libraries."""
 
+import fcntl
+import gc
 import os
 import shutil
 import sys
@@ -17,6 +19,7 @@ from tcmrl_data import Dataset, Recipe
 from tests.namespace import has_only_loopback
 from tests.workers import MARK, ROOT
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported; its threads wait busily
 sys.path.append(str(Path(__file__).parent / "doubles"))  # a distribution: methods as plug-ins
 sys.path.append(str(ROOT))  # for `benchmarks`, which makes datasets of many parts
 
@@ -28,6 +31,7 @@ TINY = (
     "behavior.sac.snapshots=[0,100,150]",
     "behavior.sac.hidden=[16,16]",
     "behavior.sac.batch_size=16",
+    "behavior.sac.train_frequency=5",
     "rollouts.episodes=6",
     "rollouts.lanes=3",
 )
@@ -60,6 +64,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     elsewhere = [item for item in items if any(map(item.get_closest_marker, left_out))]
     items[:] = [item for item in items if item not in elsewhere]
     config.hook.pytest_deselected(items=elsewhere)
+
+
+def pytest_collection_finish(session: pytest.Session) -> None:
+    """Keeps the garbage collector from the million objects of libraries and tests, which all stay."""
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture
@@ -105,13 +115,25 @@ def tiny_recipe() -> Recipe:
 def tiny_folder(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, tiny_recipe: Recipe
 ) -> Path:
-    """Folder of the tiny dataset: five tasks (one of them test), three snapshots, six episodes each."""
+    """Folder of the tiny dataset: five tasks (one of them test), three snapshots, six episodes each.
+
+    It is built once for all processes of a session; pytest-xdist gives each a folder in the session's.
+    """
     made_before: Path | None = request.config.getoption("--tiny")
     if made_before is not None:
         return made_before
-    folder = tmp_path_factory.mktemp("datasets") / "tiny"
-    report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS, workers=2)
-    assert (report.failed, report.built) == ((), len(TASKS) * 3)
+    session = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        session = session.parent
+    folder = session / "datasets" / "tiny"
+    folder.parent.mkdir(exist_ok=True)
+    with (session / "tiny.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            being_made = session / "tiny-being-made"
+            report = tcmrl_data.build_dataset(tiny_recipe, being_made, tasks=TASKS, workers=2)
+            assert (report.failed, report.built) == ((), len(TASKS) * 3)
+            being_made.rename(folder)
     return folder
 
 

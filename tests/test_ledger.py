@@ -306,6 +306,7 @@ def test_the_limits_of_tasks_and_of_parts_are_those_that_are_stated(tmp_path: Pa
         )
     steps = ",".join(map(str, range(0, 20_002, 2)))
     long = (f"behavior.sac.snapshots=[{steps}]", "behavior.sac.steps=20000", "behavior.sac.warmup=1")
+    long += ("behavior.sac.train_frequency=1",)
     recipe = load_recipe("point-robot", profile="quick", overrides=[*TINY, *long])
     with pytest.raises(BuildError, match="1,000,100 parts, more than the 1,000,000 that"):
         tcmrl_data.build_dataset(recipe, tmp_path / "out", tasks=range(100))

@@ -30,6 +30,7 @@ from tcmrl_data.foundation.errors import (
     ManifestError,
     NondeterminismError,
 )
+from tcmrl_data.store import sealing
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PARTS, PartKey, part_file, part_folder
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
