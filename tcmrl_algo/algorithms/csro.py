@@ -15,7 +15,7 @@ where only the mean was meant: see `variance`.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Literal, final
+from typing import ClassVar, Literal, final
 
 import torch
 from jaxtyping import Float
@@ -32,6 +32,7 @@ from tcmrl_algo.losses.mutual_information import club_likelihood, club_penalty
 from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig
 from tcmrl_algo.methods.padding import pad_trajectories
 from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.networks.optimizer import Adam
 from tcmrl_algo.networks.perceptron import Perceptron
@@ -167,6 +168,11 @@ class Csro(Method[CsroConfig]):
     name = "csro"
     Config = CsroConfig
     capabilities = Capabilities(explores=True)
+    search: ClassVar[Search] = {
+        **SHARED_SEARCH,
+        "csro.penalty": Factors(0.01, 10.0),
+        "csro.distance_weight": Factors(0.01, 10.0),
+    }
 
     def batch_request(self, settings: TrainingSettings, config: CsroConfig) -> BatchRequest:
         """The `[training.batch]` table without windows."""

@@ -13,7 +13,7 @@ from tcmrl_algo.context_methods.requests import trajectory_request
 from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import ACTOR_CRITIC_SEARCH, Factors, Search
+from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps
@@ -69,7 +69,7 @@ class Focal(Method[FocalConfig]):
 
     name = "focal"
     Config = FocalConfig
-    search: ClassVar[Search] = {**ACTOR_CRITIC_SEARCH, "focal.epsilon": Factors(0.1, 10.0)}
+    search: ClassVar[Search] = {**SHARED_SEARCH, "focal.epsilon": Factors(0.1, 10.0)}
 
     def batch_request(self, settings: TrainingSettings, config: FocalConfig) -> BatchRequest:
         """The `[training.batch]` table without windows."""

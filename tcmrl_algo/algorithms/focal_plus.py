@@ -30,7 +30,7 @@ from tcmrl_algo.context_methods.requests import trajectory_request
 from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import ACTOR_CRITIC_SEARCH, Factors, Search
+from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.networks.momentum import follow, momentum_copy
 from tcmrl_algo.networks.transformer import AttentionKind, TokenKind, TransitionTransformer
@@ -145,7 +145,7 @@ class FocalPlus(Method[FocalPlusConfig]):
 
     name = "focal_plus"
     Config = FocalPlusConfig
-    search: ClassVar[Search] = {**ACTOR_CRITIC_SEARCH, "focal_plus.temperature": Factors(0.1, 10.0)}
+    search: ClassVar[Search] = {**SHARED_SEARCH, "focal_plus.temperature": Factors(0.1, 10.0)}
 
     def batch_request(self, settings: TrainingSettings, config: FocalPlusConfig) -> BatchRequest:
         """The `[training.batch]` table without windows."""

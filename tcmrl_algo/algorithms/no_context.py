@@ -6,7 +6,7 @@ so that a blind critic believes every goal to pay well, and the policy leaves fo
 With rewards averaged over the training tasks the same training ends at the best fixed target.
 """
 
-from typing import ClassVar, final
+from typing import final
 
 import torch
 from jaxtyping import Float
@@ -15,7 +15,6 @@ from torch import Tensor
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import ACTOR_CRITIC_SEARCH, Search
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Transitions
 
@@ -40,7 +39,6 @@ class NoContext(Method[MethodConfig]):
 
     name = "no_context"
     capabilities = Capabilities(blind=True, needs_trajectories=False)
-    search: ClassVar[Search] = ACTOR_CRITIC_SEARCH
 
     def batch_request(self, settings: TrainingSettings, config: MethodConfig) -> BatchRequest:
         """The actor-critic's transitions: nothing here reads a trajectory."""

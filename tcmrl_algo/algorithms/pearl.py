@@ -12,7 +12,7 @@ code, how much the divergence weighs depends on the scale of the rewards.
 """
 
 from collections.abc import Sequence
-from typing import Literal, final
+from typing import ClassVar, Literal, final
 
 import torch
 from jaxtyping import Float, Int64
@@ -26,6 +26,7 @@ from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner,
 from tcmrl_algo.losses.gaussians import gaussian_divergence, product_of_gaussians
 from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectories, Trajectory, Transitions
 
@@ -113,6 +114,7 @@ class Pearl(Method[PearlConfig]):
     name = "pearl"
     Config = PearlConfig
     capabilities = Capabilities(explores=True, needs_trajectories=False)
+    search: ClassVar[Search] = {**SHARED_SEARCH, "pearl.kl_weight": Factors(0.1, 10.0)}
 
     def batch_request(self, settings: TrainingSettings, config: PearlConfig) -> BatchRequest:
         """Transitions for the actor-critic, and trajectories of the same task for the posterior."""

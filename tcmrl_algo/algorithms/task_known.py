@@ -4,7 +4,7 @@ It tells what limits a method on an environment. Where this control does well an
 method's contexts are the limit; where both do not, the data or the offline actor-critic are.
 """
 
-from typing import ClassVar, final
+from typing import final
 
 import torch
 from jaxtyping import Float
@@ -13,7 +13,6 @@ from torch import Tensor
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import ACTOR_CRITIC_SEARCH, Search
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, TrainingError, Transitions
 
@@ -53,7 +52,6 @@ class TaskKnown(Method[MethodConfig]):
 
     name = "task_known"
     capabilities = Capabilities(blind=True, privileged=True, needs_trajectories=False)
-    search: ClassVar[Search] = ACTOR_CRITIC_SEARCH
 
     def batch_request(self, settings: TrainingSettings, config: MethodConfig) -> BatchRequest:
         """The actor-critic's transitions: nothing here reads a trajectory."""

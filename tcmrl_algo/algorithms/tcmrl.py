@@ -12,7 +12,7 @@ from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner,
 from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig, Metrics
 from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import ACTOR_CRITIC_SEARCH, Options, Search
+from tcmrl_algo.methods.search import SHARED_SEARCH, Options, Search
 from tcmrl_algo.networks.attention import Attention, TaskExtractor, uniform_attention
 from tcmrl_algo.networks.perceptron import call_frozen
 from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
@@ -247,7 +247,7 @@ class Tcmrl(Method[TcmrlConfig]):
     name = "tcmrl"
     Config = TcmrlConfig
     search: ClassVar[Search] = {
-        **ACTOR_CRITIC_SEARCH,
+        **SHARED_SEARCH,
         "tcmrl.weights.negative": TRIED_WEIGHTS,
         "tcmrl.weights.sparsity": TRIED_WEIGHTS,
         "tcmrl.weights.contrastive": TRIED_WEIGHTS,

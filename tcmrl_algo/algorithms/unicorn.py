@@ -16,7 +16,7 @@ code adds noise at test too; here contexts are means over that noise, so that ad
 """
 
 import math
-from typing import Literal, final
+from typing import ClassVar, Literal, final
 
 import torch
 from jaxtyping import Float
@@ -30,6 +30,7 @@ from tcmrl_algo.losses.context import distance_metric_loss
 from tcmrl_algo.losses.mutual_information import gaussian_reconstruction, task_classification
 from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig, Metrics
 from tcmrl_algo.methods.problem import Problem
+from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.networks.gaussian import GaussianPerceptron
 from tcmrl_algo.networks.perceptron import Perceptron
@@ -151,6 +152,7 @@ class Unicorn(Method[UnicornConfig]):
 
     name = "unicorn"
     Config = UnicornConfig
+    search: ClassVar[Search] = {**SHARED_SEARCH, "unicorn.beta": Factors(0.1, 10.0)}
 
     def batch_request(self, settings: TrainingSettings, config: UnicornConfig) -> BatchRequest:
         """The `[training.batch]` table without windows."""

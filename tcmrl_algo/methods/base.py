@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import OPTIMIZER_SEARCH, Search
+from tcmrl_algo.methods.search import SHARED_SEARCH, Search
 from tcmrl_algo.methods.stages import Stage
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Controller, Trajectory, UniformController
@@ -119,7 +119,7 @@ class Method(abc.ABC, Generic[ConfigT]):
     name: ClassVar[str]
     Config: ClassVar[type[MethodConfig]] = MethodConfig
     capabilities: ClassVar[Capabilities] = Capabilities()
-    search: ClassVar[Search] = OPTIMIZER_SEARCH
+    search: ClassVar[Search] = SHARED_SEARCH
 
     @abc.abstractmethod
     def batch_request(self, settings: TrainingSettings, config: ConfigT) -> BatchRequest:

@@ -33,8 +33,8 @@ class Factors:
 Search = Mapping[str, Options | Factors]
 """What is searched, by `section.key` as `--set` names it."""
 
-OPTIMIZER_SEARCH: Search = {"optimizer.learning_rate": Factors(1 / 3, 3.0)}
-"""Of a method that says nothing else."""
-
-ACTOR_CRITIC_SEARCH: Search = {**OPTIMIZER_SEARCH, "actor_critic.entropy": Factors(0.1, 10.0)}
-"""What all methods with the shared actor-critic search alike."""
+SHARED_SEARCH: Search = {
+    "optimizer.learning_rate": Factors(1 / 3, 3.0),
+    "actor_critic.entropy": Factors(0.1, 10.0),
+}
+"""What all methods search that train the shared actor-critic, by equal ranges; a method may add to it."""
