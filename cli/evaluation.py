@@ -19,12 +19,14 @@ OTHER = "other: the same policy with the contexts of other tasks"
 PRIVILEGED = "privileged: a control that observes the task parameters"
 SCORES = {
     "regret": "regret: oracle - adapted",
-    "normalized": "normalized: 0 is uniform actions, 1 the best behavior policy",
+    "normalized": "normalized: 0 is uniform actions, 1 the best behavior policy without its noise",
 }
+FIXED = "fixed: the best policy that acts the same in all tasks, fitted on the training tasks"
+BEHAVIOR = "behavior: the best behavior policy of the task itself, without its noise"
 
 
 def score_tables(results: Sequence["Evaluation"]) -> list["Table"]:
-    """Tables of returns by test task, one per protocol; for several protocols, after a table of means."""
+    """Tables of returns: controls, means by protocol if there are several, and test tasks by protocol."""
     first = results[0]
     mark = " (privileged)" if first.privileged else ""
     run = f"{first.algorithm}{mark} on {first.environment}, seed {first.seed}"
@@ -48,7 +50,18 @@ def score_tables(results: Sequence["Evaluation"]) -> list["Table"]:
         block.add_row("mean", *mean)
         blocks.append(block)
         means.add_row(result.protocol, *mean)
-    return [means, *blocks] if len(results) > 1 else blocks
+    return [_controls_table(first), *([means] if len(results) > 1 else []), *blocks]
+
+
+def _controls_table(result: "Evaluation") -> "Table":
+    """Mean returns of the controls of the dataset, which are those of every protocol."""
+    table = make_table(
+        f"{result.environment}: controls, means over {len(result.tasks)} test tasks",
+        columns=("uniform", "fixed", "behavior", "oracle"),
+    )
+    names = ("random", "fixed", "behavior", "oracle")
+    table.add_row(*(number(_mean([getattr(task, name) for task in result.tasks])) for name in names))
+    return table
 
 
 def _values(task: "TaskResult", score: str, *, with_success: bool) -> list[float | None]:
@@ -106,8 +119,9 @@ def evaluate(
     The protocol chooses the trajectories that the policy adapts to: trajectories that it collects on the
     test task, stored trajectories of the test task, or stored trajectories of training tasks.
 
-    The returns are compared with those of uniform actions, of the oracle, and of the same policy with the
-    contexts of other tasks. Returns are undiscounted. With --protocol all, --json prints a list of documents.
+    The returns are compared with the controls of the dataset (`tcmrl controls`), which are measured once, and
+    with the same policy under the contexts of other tasks. Returns are undiscounted. With --protocol all,
+    --json prints a list of documents.
 
     \b
     Examples:
@@ -133,7 +147,13 @@ def evaluate(
         return
     for table in score_tables(results):
         print_table(table)
-    notes = [OTHER, SCORES[_score(results)], *([PRIVILEGED] if results[0].privileged else [])]
+    notes = [
+        FIXED,
+        BEHAVIOR,
+        OTHER,
+        SCORES[_score(results)],
+        *([PRIVILEGED] if results[0].privileged else []),
+    ]
     remark("; ".join(notes), quiet=quiet)
 
 

@@ -8,6 +8,7 @@ import click
 
 from tcmrl_data.recipe.profile import PROFILES, Profile
 
+from .controls import controls
 from .evaluation import evaluate
 from .experiments import experiment
 from .frame import (
@@ -53,6 +54,7 @@ def tcmrl() -> None:
     """
 
 
+tcmrl.add_command(controls)
 tcmrl.add_command(evaluate)
 tcmrl.add_command(experiment)
 tcmrl.add_command(report)

@@ -1,10 +1,12 @@
 from .adaptation.arena import Arena as Arena
-from .adaptation.evaluate import Evaluation as Evaluation
-from .adaptation.evaluate import TaskResult as TaskResult
+from .adaptation.control_records import Controls as Controls
+from .adaptation.controls import dataset_controls as dataset_controls
 from .adaptation.evaluate import evaluate_run as evaluate_run
 from .adaptation.protocols.base import PROTOCOLS as PROTOCOLS
 from .adaptation.protocols.base import Adaptation as Adaptation
 from .adaptation.protocols.base import Protocol as Protocol
+from .adaptation.results import Evaluation as Evaluation
+from .adaptation.results import TaskResult as TaskResult
 from .context_methods.learner import ContextAlgorithm as ContextAlgorithm
 from .context_methods.learner import ContextLearner as ContextLearner
 from .context_methods.learner import ContextLosses as ContextLosses

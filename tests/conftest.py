@@ -79,6 +79,14 @@ def sweep(request: pytest.FixtureRequest) -> int:
     return stride
 
 
+@pytest.fixture(scope="session", autouse=True)
+def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A cache of this session, so that no test finds what an earlier version left in the user's."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TCMRL_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield
+
+
 @pytest.fixture(scope="session")
 def mark() -> Iterator[str]:
     """A mark in the environment of every process that this session starts."""

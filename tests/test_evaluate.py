@@ -96,7 +96,9 @@ def test_without_an_oracle_regret_is_null_and_behavior_norms(
     (task,) = result.tasks
     assert task.oracle is task.regret is result.mean_regret is None
     assert task.reference == "behavior"
-    expected = (task.final - references.uniform) / (references.behavior - references.uniform)
+    assert task.behavior is not None  # the noise-free return, beside a noise-free adapted policy
+    assert task.behavior != pytest.approx(references.behavior)
+    expected = (task.final - references.uniform) / (task.behavior - references.uniform)
     assert task.normalized == pytest.approx(expected)
 
 
@@ -183,11 +185,12 @@ def test_evaluate_command_prints_the_documented_json(trained: Path, call: Call) 
     assert (code, errors) == (0, "")
     assert set(document) == {
         "algorithm", "environment", "seed", "protocol", "repeats", "tasks", "adaptation_curve",
-        "mean_final", "mean_regret", "mean_normalized", "mean_shuffled", "privileged",
+        "mean_final", "mean_regret", "mean_normalized", "mean_shuffled", "mean_behavior", "mean_fixed",
+        "privileged",
     }  # fmt: skip
     (task,) = document["tasks"]
     assert set(task) == {
-        "task", "split", "returns", "final", "finals", "oracle", "random",
+        "task", "split", "returns", "final", "finals", "oracle", "random", "behavior", "fixed",
         "regret", "normalized", "reference", "success", "shuffled",
     }  # fmt: skip
     assert len(task["returns"]) == 4
@@ -222,17 +225,18 @@ def test_evaluations_by_every_protocol_fit_a_terminal_with_every_number_whole(tr
 def test_long_returns_of_twenty_tasks_fit_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     task = TaskResult(
         task=0, split="test", returns=[], final=-1234.56, finals=[-1234.56], oracle=-1023.45, random=-9876.54,
+        behavior=-1050.0, fixed=-4321.0,
         regret=1000.0, normalized=0.9, reference="oracle", success=0.25, shuffled=-1234.57,
     )  # fmt: skip
     tasks = [replace(task, task=index) for index in range(20)]
     result = Evaluation(
-        "a_method", "walker-rand-params", 10, "offline", 1, tasks, [], 0.0, None, None, 0.0, True
+        "a_method", "walker-rand-params", 10, "offline", 1, tasks, [], 0.0, None, None, 0.0, 0.0, 0.0, True
     )
     for table in score_tables([result, replace(result, protocol="a_new_protocol")]):
         print_table(table)  # to a pipe: as wide as its columns
     output = capsys.readouterr().out
     assert_fits(output)
-    assert output.count("-9,876.54") == 2 + 2 * 21
+    assert output.count("-9,876.54") == 1 + 2 + 2 * 21  # controls, means, tasks and their mean
 
 
 def test_one_protocol_shows_its_tasks_and_their_mean(trained: Path, call: Call) -> None:
@@ -337,5 +341,7 @@ def test_evaluate_command_refuses_bad_input_in_one_line(trained: Path, tmp_path:
 
 
 def test_evaluation_serialises() -> None:
-    evaluation = Evaluation("tcmrl", "point-robot", 0, "idaq", 1, [], [], 0.0, None, None, 0.0, False)
+    evaluation = Evaluation(
+        "tcmrl", "point-robot", 0, "idaq", 1, [], [], 0.0, None, None, 0.0, None, None, False
+    )
     assert json.loads(json.dumps(evaluation.to_json()))["mean_regret"] is None

@@ -19,5 +19,13 @@ def test_parameters_are_standardised_by_the_training_tasks() -> None:
 
 
 def test_a_parameter_that_is_no_number_is_named() -> None:
+    scaled = TaskParameters([task(3, side="right", speed=1.0)])
     with pytest.raises(TrainingError, match=r"task 4 has the parameter 'left'"):
-        TaskParameters([task(4, side="left")])
+        scaled([task(4, side="left", speed=1.0)])
+    with pytest.raises(TrainingError, match=r"task 4 has the parameter 'left'"):
+        TaskParameters([task(3, side="right"), task(4, side="left")])
+
+
+def test_a_text_that_all_tasks_share_is_left_out() -> None:
+    scaled = TaskParameters([task(0, simulator="arm", speed=1.0), task(1, simulator="arm", speed=3.0)])
+    torch.testing.assert_close(scaled([task(2, simulator="arm", speed=4.0)]), torch.tensor([[2.0]]))

@@ -145,7 +145,7 @@ def test_lanes_beyond_one_batch_keep_their_order(two_tests: Dataset, monkeypatch
         return [trajectory.undiscounted_return for trajectory in place.adapted(tasks, contexts, episode=0)]
 
     whole = returns()
-    monkeypatch.setattr("tcmrl_algo.adaptation.arena.MOST_LANES", 2)
+    monkeypatch.setattr("tcmrl_algo.adaptation.lane_stage.MOST_LANES", 2)
     assert returns() == pytest.approx(whole)
 
 
@@ -226,7 +226,7 @@ def test_task_parameters_reach_no_method_without_the_capability(
 def test_a_privileged_method_is_given_the_parameters_of_every_lane(
     two_tests: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tcmrl_algo.adaptation.arena.MOST_LANES", 2)
+    monkeypatch.setattr("tcmrl_algo.adaptation.lane_stage.MOST_LANES", 2)
     first, second = two_tests.test_tasks
     method, tasks = Watched(), [second, first, first]
     place = arena(two_tests, method, capabilities=Capabilities(privileged=True))

@@ -6,27 +6,19 @@ from typing import final
 import numpy as np
 import numpy.typing as npt
 
+from tcmrl_algo.adaptation.lane_stage import LaneStage
 from tcmrl_algo.methods.base import Algorithm, Capabilities
 from tcmrl_algo.methods.privileged import TaskParameters
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_data import (
     Controller,
     Dataset,
-    Lanes,
     Purpose,
     Task,
     TrainingError,
     Trajectory,
     keyed_generator,
-    keyed_seed,
-    roll_out,
 )
-
-MOST_LANES = 50
-"""Most episodes that are stepped together; this many Meta-World lanes take 1 GB and 8 s to create."""
-
-KEPT_BYTES = 2 * 2**30
-"""Most memory of simulators that are kept for the next episodes of the same tasks."""
 
 FloatArray = npt.NDArray[np.floating]
 
@@ -69,7 +61,12 @@ class Arena:
         self._capabilities = capabilities
         self._parameters = TaskParameters(dataset.train_tasks) if capabilities.privileged else None
         self._stage, self._done, self._total = "", 0, 0
-        self._lanes: dict[tuple[int, ...], Lanes] = {}
+        self._lanes = LaneStage(
+            dataset.environment,
+            seed=seed,
+            reset=Purpose.EVALUATION_RESET,
+            noise=Purpose.EVALUATION_NOISE,
+        )
         self._stored: dict[int, list[Trajectory]] = {}
 
     def begin(self, stage: str, total: int) -> None:
@@ -90,13 +87,21 @@ class Arena:
             TrainingError: an empty context, for a method that needs trajectories.
         """
         self._check_contexts(tasks, contexts)
-        return self._run(tasks, contexts, self._adapt, episode=episode)
+
+        def control(lanes: slice) -> Controller:
+            return self._adapt(tasks[lanes], contexts[lanes])
+
+        return self._lanes.run(tasks, control, episode=episode, done=self._count)
 
     def explored(
         self, tasks: Sequence[Task], collected: Sequence[Context], *, episode: int
     ) -> list[Trajectory]:
         """One episode per lane by the exploration of the method, which is uniform actions by default."""
-        return self._run(tasks, collected, self._explore, episode=episode)
+
+        def control(lanes: slice) -> Controller:
+            return self._algorithm.explore(collected[lanes])
+
+        return self._lanes.run(tasks, control, episode=episode, done=self._count)
 
     def stored(self, task: Task, *, draw: int) -> Context:
         """Draws `offline_trajectories` stored trajectories of a task without replacement."""
@@ -123,8 +128,11 @@ class Arena:
 
     def close(self) -> None:
         """Closes all lanes."""
-        while self._lanes:
-            self._lanes.popitem()[1].close()
+        self._lanes.close()
+
+    def _count(self, episodes: int) -> None:
+        self._done += episodes
+        self._report(self._stage, self._done, self._total)
 
     def _check_contexts(self, tasks: Sequence[Task], contexts: Sequence[Context]) -> None:
         if not self._capabilities.needs_trajectories:
@@ -142,47 +150,3 @@ class Arena:
         if self._parameters is None:
             return self._algorithm.adapt(contexts)
         return self._algorithm.adapt(contexts, privileged=self._parameters(tasks))
-
-    def _explore(self, tasks: Sequence[Task], collected: Sequence[Context]) -> Controller:
-        return self._algorithm.explore(collected)
-
-    def _lanes_of(self, tasks: Sequence[Task]) -> Lanes:
-        """Lanes of the tasks. They are kept, because adaptation repeats tasks; the oldest give way."""
-        key, environment = tuple(task.index for task in tasks), self.dataset.environment
-        if key not in self._lanes:
-            kept = KEPT_BYTES // max(1, environment.simulator_bytes) - len(key)
-            while self._lanes and sum(map(len, self._lanes)) > kept:
-                self._lanes.pop(next(iter(self._lanes))).close()
-            self._lanes[key] = environment.lanes([task.parameters for task in tasks])
-        return self._lanes[key]
-
-    def _run(
-        self,
-        tasks: Sequence[Task],
-        contexts: Sequence[Context],
-        control: Callable[[Sequence[Task], Sequence[Context]], Controller],
-        *,
-        episode: int,
-    ) -> list[Trajectory]:
-        """One episode per lane, at most MOST_LANES at a time; the position of a lane is part of its keys."""
-        trajectories: list[Trajectory] = []
-        for start in range(0, len(tasks), MOST_LANES):
-            chunk = slice(start, start + MOST_LANES)
-            keys = [(task.index, start + lane) for lane, task in enumerate(tasks[chunk])]
-            run, name = self._seed, self.dataset.name
-            trajectories += roll_out(
-                self.dataset.environment,
-                self._lanes_of(tasks[chunk]),
-                control(tasks[chunk], contexts[chunk]),
-                reset_seeds=[
-                    keyed_seed(run, name, task, Purpose.EVALUATION_RESET, episode, lane)
-                    for task, lane in keys
-                ],
-                noise=[
-                    keyed_generator(run, name, task, Purpose.EVALUATION_NOISE, episode, lane)
-                    for task, lane in keys
-                ],
-            )
-            self._done += len(keys)
-            self._report(self._stage, self._done, self._total)
-        return trajectories

@@ -1,17 +1,17 @@
 """Meta-testing: adapts a trained run to the test tasks, and compares its returns with controls."""
 
-import dataclasses
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from tcmrl_algo.adaptation.arena import Arena, Context, ProgressCallback, ignore_progress
+from tcmrl_algo.adaptation.control_records import Controls
+from tcmrl_algo.adaptation.controls import dataset_controls
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS, Adaptation
+from tcmrl_algo.adaptation.results import Evaluation, Reference, TaskResult
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_algo.training.checkpoint import Run, open_run
 from tcmrl_algo.training.config import method_of
@@ -21,75 +21,6 @@ from tcmrl_data import Dataset, Task, TrainingError, Trajectory
 
 MOST_OTHERS = 3
 """Most other tasks whose contexts are tried on a task; a single one may be very similar or dissimilar."""
-
-
-@dataclass(frozen=True)
-class TaskResult:
-    """Result of a run on one test task; returns are undiscounted sums of rewards.
-
-    Attributes:
-        task: index of the task.
-        split: `test`.
-        returns: returns of the adaptation episodes, means over the repeats of the protocol.
-        final: mean return of the adapted policy.
-        finals: the same for every repeat; their spread is that of the protocol's own chance.
-        oracle: return of a controller that knows the task, None if the environment has none.
-        random: return of uniform actions, None if it was not measured.
-        regret: oracle - final, None without an oracle.
-        normalized: (final - random) / (best - random), with `best` the return of the reference.
-        reference: where `normalized` is 1: the `oracle` or, without one, the best `behavior` policy.
-        success: share of successful final episodes, None if the environment does not define success.
-        shuffled: mean return of the same policy with the contexts of other tasks. A policy that adapts
-            within an episode starts with the belief of the other task and updates it by its observations,
-            so the value measures how well it corrects a wrong belief. A privileged policy keeps the
-            parameters of the task itself.
-    """
-
-    task: int
-    split: str
-    returns: list[float]
-    final: float
-    finals: list[float]
-    oracle: float | None
-    random: float | None
-    regret: float | None
-    normalized: float | None
-    reference: Literal["oracle", "behavior"]
-    success: float | None
-    shuffled: float
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Result of a run on all test tasks; means are over tasks, and None if a task has no value.
-
-    Attributes:
-        algorithm, environment, seed, protocol: which evaluation this is.
-        repeats: how many times the protocol was run; 1 unless its first stage is random.
-        tasks: results by test task.
-        adaptation_curve: mean returns of the first, second, … adaptation episode: how many episodes it
-            takes until the policy is adapted. The episodes are those of the protocol; under `paper` the
-            first ones act uniformly.
-        mean_final, mean_regret, mean_normalized, mean_shuffled: means of the tasks' values.
-        privileged: whether the method is a control that observes the task parameters.
-    """
-
-    algorithm: str
-    environment: str
-    seed: int
-    protocol: str
-    repeats: int
-    tasks: list[TaskResult]
-    adaptation_curve: list[float]
-    mean_final: float
-    mean_regret: float | None
-    mean_normalized: float | None
-    mean_shuffled: float
-    privileged: bool
-
-    def to_json(self) -> dict[str, Any]:
-        """The JSON document of `tcmrl evaluate --json`."""
-        return dataclasses.asdict(self)
 
 
 def evaluate_run(
@@ -152,12 +83,14 @@ def evaluate_open_run(
     algorithm.load_tensors(run.newest().tensors())
     method, _ = method_of(run.record.config)
     seed = run.record.seed
+    controls = dataset_controls(dataset, report=report)
     arena = Arena(dataset, algorithm, settings, capabilities=method.capabilities, seed=seed, report=report)
     repeats = settings.repeats if protocol.repeated else 1
     try:
         arena.begin("adaptation", len(tasks) * repeats * settings.episodes)
         adaptations = protocol.adapt(arena, [task for task in tasks for _ in range(repeats)])
-        results = _results(arena, tasks, [adaptations[repeats * i :][:repeats] for i in range(len(tasks))])
+        by_task = [adaptations[repeats * place :][:repeats] for place in range(len(tasks))]
+        results = _results(arena, tasks, by_task, controls)
     finally:
         arena.close()
     return Evaluation(
@@ -172,12 +105,14 @@ def evaluate_open_run(
         mean_regret=_mean([result.regret for result in results]),
         mean_normalized=_mean([result.normalized for result in results]),
         mean_shuffled=fmean(result.shuffled for result in results),
+        mean_behavior=_mean([result.behavior for result in results]),
+        mean_fixed=_mean([result.fixed for result in results]),
         privileged=run.record.privileged or method.capabilities.privileged,
     )
 
 
 def _results(
-    arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Sequence[Adaptation]]
+    arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Sequence[Adaptation]], controls: Controls
 ) -> list[TaskResult]:
     """Results of every task, given its adaptations, one per repeat."""
     own = {
@@ -191,9 +126,9 @@ def _results(
     shuffled = _final_episodes(arena, tasks, others)
     results = []
     for task, repeats in zip(tasks, adaptations, strict=True):
-        references = arena.dataset.references(task.index)
+        references, control = arena.dataset.references(task.index), controls.task(task.index)
         mean = _mean_return(final[task.index])
-        best = references.behavior if references.oracle is None else references.oracle
+        reference, best = _reference(references.oracle, control.behavior, references.behavior)
         results.append(
             TaskResult(
                 task=task.index,
@@ -203,9 +138,11 @@ def _results(
                 finals=_finals(final[task.index], [len(one.contexts) for one in repeats]),
                 oracle=references.oracle,
                 random=references.uniform,
+                behavior=control.behavior,
+                fixed=control.fixed,
                 regret=None if references.oracle is None else references.oracle - mean,
                 normalized=_share(mean, references.uniform, best),
-                reference="behavior" if references.oracle is None else "oracle",
+                reference=reference,
                 success=_success(final[task.index]),
                 shuffled=_mean_return(shuffled[task.index]),
             )
@@ -275,6 +212,13 @@ def _success(trajectories: Sequence[Trajectory]) -> float | None:
     if any("success" not in trajectory.extras for trajectory in trajectories):
         return None
     return fmean(float(trajectory.extras["success"].any()) for trajectory in trajectories)
+
+
+def _reference(oracle: float | None, behavior: float | None, stored: float) -> tuple[Reference, float]:
+    """The return at which `normalized` is 1, and what it is."""
+    if oracle is not None:
+        return "oracle", oracle
+    return ("stored", stored) if behavior is None else ("behavior", behavior)
 
 
 def _share(value: float, low: float | None, high: float) -> float | None:

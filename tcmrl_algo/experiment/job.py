@@ -13,7 +13,8 @@ from typing import Any
 import torch
 from pydantic import BaseModel, ConfigDict
 
-from tcmrl_algo.adaptation.evaluate import Evaluation, evaluate_run
+from tcmrl_algo.adaptation.evaluate import evaluate_run
+from tcmrl_algo.adaptation.results import Evaluation
 from tcmrl_algo.experiment.results import CurvePoint, RunResult, result_file
 from tcmrl_algo.training.checkpoint import open_run, tensors_digest
 from tcmrl_algo.training.config import TrainingConfig, stage_plan
