@@ -105,12 +105,26 @@ def _mean(values: Sequence[float | None]) -> float | None:
     show_default="the run's",
     help="Number of adaptation episodes per task.",
 )
+@click.option(
+    "--random-episodes",
+    type=click.IntRange(min=0),
+    show_default="the run's",
+    help="How many of them form the first stage of `paper` and `idaq_literal`.",
+)
+@click.option(
+    "--repeats",
+    type=click.IntRange(min=1),
+    show_default="the run's",
+    help="How many times a protocol with a random first stage is run.",
+)
 @output_options
 def evaluate(
     run_folder: Path,
     protocol: str | None,
     dataset: Path | None,
     episodes: int | None,
+    random_episodes: int | None,
+    repeats: int | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -127,6 +141,7 @@ def evaluate(
     Examples:
       tcmrl evaluate runs/point-robot-tcmrl-seed0
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all --json
+      tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol paper --random-episodes 2 --repeats 10
     """
     from tcmrl_algo import evaluate_run
 
@@ -139,7 +154,15 @@ def evaluate(
                 progress.update(label, done=done, total=total, unit="episodes")
 
             results.append(
-                evaluate_run(run_folder, protocol=name, dataset_path=dataset, episodes=episodes, report=show)
+                evaluate_run(
+                    run_folder,
+                    protocol=name,
+                    dataset_path=dataset,
+                    episodes=episodes,
+                    random_episodes=random_episodes,
+                    repeats=repeats,
+                    report=show,
+                )
             )
     if as_json:
         documents = [result.to_json() for result in results]

@@ -198,6 +198,18 @@ def test_evaluate_command_prints_the_documented_json(trained: Path, call: Call) 
     assert task["success"] is None
 
 
+def test_evaluate_command_changes_the_random_stage(trained: Path, call: Call) -> None:
+    options = ("--protocol", "paper", "--random-episodes", 1, "--repeats", 2, "--json", "--quiet")
+    code, output, _ = call("evaluate", trained, *options)
+    document = json.loads(output)
+    assert (code, document["repeats"]) == (0, 2)
+    assert document == evaluate_run(trained, protocol="paper", random_episodes=1, repeats=2).to_json()
+    more = evaluate_run(trained, protocol="paper", random_episodes=2, repeats=2)
+    first, second, *_ = document["adaptation_curve"]
+    assert more.adaptation_curve[0] == pytest.approx(first)
+    assert more.adaptation_curve[1] != pytest.approx(second)
+
+
 def test_evaluate_command_compares_all_protocols(trained: Path, call: Call) -> None:
     code, output, _ = call("evaluate", trained, "--protocol", "all")
     assert code == 0

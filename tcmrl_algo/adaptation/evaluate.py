@@ -29,6 +29,7 @@ def evaluate_run(
     protocol: str | None = None,
     dataset_path: str | Path | None = None,
     episodes: int | None = None,
+    random_episodes: int | None = None,
     repeats: int | None = None,
     report: ProgressCallback = ignore_progress,
 ) -> Evaluation:
@@ -39,6 +40,7 @@ def evaluate_run(
         protocol: replaces the protocol of the run.
         dataset_path: folder of the run's dataset, if the dataset was moved.
         episodes: replaces the number of adaptation episodes per task of the run.
+        random_episodes: replaces `run.random_episodes`, how many of them form the first stage.
         repeats: replaces `run.repeats`, how many times a protocol with a random first stage is run.
         report: called when episodes end.
 
@@ -54,7 +56,12 @@ def evaluate_run(
     run = open_run(run_folder)
     dataset = run.open_dataset(dataset_path)
     settings = run.record.config.settings.run
-    changes = {"protocol": protocol, "episodes": episodes, "repeats": repeats}
+    changes = {
+        "protocol": protocol,
+        "episodes": episodes,
+        "random_episodes": random_episodes,
+        "repeats": repeats,
+    }
     settings = settings.model_copy(update={key: value for key, value in changes.items() if value is not None})
     torch.set_num_threads(settings.threads)
     evaluation = evaluate_open_run(run, dataset, settings, report=report)
