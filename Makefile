@@ -30,7 +30,7 @@ $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(INSTALLED_TEST): $(INSTALLED)
-	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[minari,ray,tensordict,test,tune]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[minari,parquet,ray,tensordict,test,tune]'
 	@touch $@
 
 demo: $(INSTALLED)

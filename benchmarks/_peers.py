@@ -15,7 +15,7 @@ import numpy.typing as npt
 import torch
 
 import tcmrl_data
-from tcmrl_data.interchange.formats.minari import MinariFormat, dataset_id
+from tcmrl_data.interchange.formats.minari import dataset_id
 from tcmrl_data.interchange.views.sb3_buffer import to_sb3_buffer
 
 Draw = Callable[[], object]
@@ -151,7 +151,7 @@ def minari_datasets(data: Data, work: Work, root: Path) -> dict[str, Draws]:
     import minari
 
     if not root.exists():
-        MinariFormat().export(data.selection.dataset, root)
+        tcmrl_data.export_dataset(data.selection.dataset, "minari", root)
     os.environ["MINARI_DATASETS_PATH"] = str(root.resolve())
     tasks = [task.index for task in data.selection.tasks]
     opened = [minari.load_dataset(dataset_id(data.selection.dataset, task)) for task in tasks]

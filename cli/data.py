@@ -5,17 +5,14 @@ from pathlib import Path
 
 import click
 
-from tcmrl_data.foundation.sizes import size
-
 from .building import build, plan
 from .cache import cache
 from .curation import delete, derive, merge, rename, split
 from .diff import diff
+from .exporting import export
 from .frame import main_program, make_table, output_options, print_json, print_table, remark
 from .importing import import_data
 from .inspection import inspect
-from .plugins import FORMAT
-from .progress import StageProgress
 from .recipes import recipe
 from .remaking import extend, relabel
 from .show import show
@@ -64,6 +61,7 @@ for _command in (
     rename,
     delete,
     diff,
+    export,
     extend,
     relabel,
 ):
@@ -139,62 +137,3 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
         counts = (f"{row['tasks']:,}", f"{row['parts']:,}")
         table.add_row(row["path"], built_from, *counts, state, row["root"][:12])
     print_table(table)
-
-
-@data.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
-@click.option("--format", "format_name", required=True, type=FORMAT, help="Export format.")
-@click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    show_default="DATASET-FORMAT",
-    help="Folder to create.",
-)
-@click.option(
-    "--snapshots",
-    default="all",
-    show_default=True,
-    metavar="RULE",
-    help="Snapshots to export: all, last, steps>=N, return>=Q with a quantile Q, or tier:NAME.",
-)
-@output_options
-def export(
-    dataset: Path, format_name: str, out: Path | None, snapshots: str, as_json: bool, quiet: bool
-) -> None:
-    """Export DATASET to another format.
-
-    DATASET is the dataset's folder or its manifest.json. Every task becomes one HDF5 file or one Minari
-    dataset in a new folder. Minari opens its datasets by name if MINARI_DATASETS_PATH is that folder.
-
-    \b
-    Examples:
-      tcmrl-data export data/point-robot --format hdf5 --snapshots last
-      tcmrl-data export data/point-robot --format minari --out minari
-      MINARI_DATASETS_PATH=minari minari list local
-    """
-    import tcmrl_data
-
-    exporter = tcmrl_data.FORMATS.get(format_name)()
-    opened = tcmrl_data.open_dataset(dataset)
-    place = opened.path if opened.path.name not in ("", "..") else opened.path.resolve()
-    target = out or place.with_name(f"{place.stem if place.is_file() else place.name}-{format_name}")
-    with StageProgress(quiet=quiet) as progress:
-        files = exporter.export(
-            opened,
-            target,
-            snapshots=snapshots,
-            progress=lambda done, total: progress.update("export", done=done, total=total, unit="parts"),
-        )
-    total = sum(file.stat().st_size for file in files)
-    if as_json:
-        print_json(
-            {
-                "format": format_name,
-                "out": str(target),
-                "files": [str(file) for file in files],
-                "bytes": total,
-            }
-        )
-    else:
-        click.echo(f"{target}: {len(files):,} files, {size(total)}")

@@ -53,6 +53,8 @@ from .foundation.seeding import Purpose as Purpose
 from .foundation.seeding import keyed_generator as keyed_generator
 from .foundation.seeding import keyed_seed as keyed_seed
 from .foundation.sizes import parse_bytes as parse_bytes
+from .interchange.exporting import ExportReport as ExportReport
+from .interchange.exporting import export_dataset as export_dataset
 from .interchange.formats.base import FORMATS as FORMATS
 from .interchange.importing import ImportReport as ImportReport
 from .interchange.importing import import_dataset as import_dataset

@@ -420,4 +420,4 @@ MINARI: dict[str, Make] = {
 }
 
 CASES: dict[str, Make] = IDAQ | HDF5 | MINARI
-FORMATS = {"npy": "idaq-npy", "hdf5": "hdf5", "minari": "minari"}
+FORMATS = {"npy": "idaq-npy", "hdf5": "hdf5", "minari": "minari", "parquet": "parquet"}

@@ -9,8 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 import tcmrl_data
-from tcmrl_data import derive_dataset, open_dataset
-from tcmrl_data.interchange.formats.hdf5 import Hdf5Format
+from tcmrl_data import derive_dataset, export_dataset
 from tests.conftest import TASKS, TINY
 from tests.kill_sweep import Case, run_sweep
 
@@ -26,7 +25,7 @@ def cases(folder: Path, tiny: Path) -> dict[str, Case]:
     """
     for name, tasks in (("left", TASKS[:3]), ("right", TASKS[2:])):
         derive_dataset(tiny, folder / name, tasks=tasks)
-    files = Hdf5Format().export(open_dataset(tiny), folder / "hdf5")
+    files = export_dataset(tiny, "hdf5", folder / "hdf5").files
     derive_dataset(tiny, folder / "two", tasks=TASKS[:2])
     parts = len(TASKS) * SNAPSHOTS
     extend = ("--episodes", 3, "--snapshots", "all", "--workers", 2)

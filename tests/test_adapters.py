@@ -21,11 +21,12 @@ from tcmrl_data import (
     Selection,
     Trajectory,
     Transitions,
+    export_dataset,
+    import_dataset,
     keyed_seed,
     open_sampler,
 )
 from tcmrl_data.foundation.errors import MissingPackageError, SelectionError, StoreError
-from tcmrl_data.interchange.formats.minari import MinariFormat
 from tcmrl_data.interchange.views.sb3_buffer import to_sb3_buffer
 from tcmrl_data.interchange.views.tensordict import to_tensordict, view_steps
 from tcmrl_data.interchange.views.torch_dataset import TrajectoryDataset
@@ -193,13 +194,13 @@ def test_minari_opens_iterates_and_samples_what_was_exported(
 ) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "elsewhere"))
-    files = MinariFormat().export(tiny, tmp_path / "out", snapshots="steps>=100")
+    report = export_dataset(tiny, "minari", tmp_path / "out", snapshots="steps>=100")
     assert os.environ["MINARI_DATASETS_PATH"] == str(tmp_path / "elsewhere")
     assert not (tmp_path / "elsewhere").exists()
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
     names = [f"tcmrl/point-robot/task{task:05d}-steps-ge-100-v0" for task in TASKS]
     assert list(minari.list_local_datasets()) == names
-    assert set(files) == {path for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    assert set(report.files) == {path for path in (tmp_path / "out").rglob("*") if path.is_file()}
     for name, task in zip(names, TASKS, strict=True):
         opened = minari.load_dataset(name)
         expected = tiny.select(snapshots="steps>=100").trajectories(task)
@@ -224,7 +225,7 @@ def test_minari_refuses_an_episode_without_steps(
     empty = Trajectory(np.zeros((1, 2)), np.zeros((0, 2)), np.zeros(0), none, none)
     monkeypatch.setattr(Dataset, "trajectories", lambda self, *key: [empty])
     with pytest.raises(StoreError, match=r"0000150.zip: episode 0 has no steps.*hdf5"):
-        MinariFormat().export(tiny, tmp_path / "out", snapshots="last")
+        export_dataset(tiny, "minari", tmp_path / "out", snapshots="last")
     assert list(tmp_path.iterdir()) == []
 
 
@@ -233,7 +234,7 @@ def test_minari_knows_the_scores_and_makes_the_task_again(
 ) -> None:
     minari = pytest.importorskip("minari")
     monkeypatch.chdir(tmp_path)
-    MinariFormat().export(tiny, Path("out"), snapshots="last")
+    export_dataset(tiny, "minari", Path("out"), snapshots="last")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
     opened = minari.load_dataset("tcmrl/point-robot/task00040-last-v0")
     references = tiny.references(40)
@@ -268,7 +269,7 @@ def test_minari_recovers_an_environment_with_the_spaces_of_the_data(
 ) -> None:
     """The assertions of `check_env_recovery` in Minari's tests; observations also lie in their space."""
     minari = pytest.importorskip("minari")
-    MinariFormat().export(tiny, tmp_path / "out", snapshots="last")
+    export_dataset(tiny, "minari", tmp_path / "out", snapshots="last")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "out"))
     opened = minari.load_dataset("tcmrl/point-robot/task00040-last-v0")
     original = gymnasium.make(opened.spec.env_spec)
@@ -285,7 +286,9 @@ def test_minari_recovers_an_environment_with_the_spaces_of_the_data(
 @pytest.mark.parametrize(
     ("package", "extra", "use"),
     [
-        ("minari", "minari", lambda data, out: MinariFormat().export(data, out)),
+        ("minari", "minari", lambda data, out: export_dataset(data, "minari", out)),
+        ("pyarrow", "parquet", lambda data, out: export_dataset(data, "parquet", out)),
+        ("pyarrow", "parquet", lambda data, out: import_dataset("parquet", [out], out)),
         ("tensordict", "tensordict", lambda data, out: to_tensordict(data.select())),
     ],
 )

@@ -127,6 +127,24 @@ def test_list_without_datasets_says_how_to_get_one(
     assert_refused(call("list", tmp_path / "nothing"), "nothing", "is not a folder")
 
 
+def test_export_takes_a_selection_and_only_says_what_it_would_write(
+    call: Call, tiny: Dataset, tmp_path: Path
+) -> None:
+    arguments = ("export", tiny.folder, "--format", "robomimic", "--out", tmp_path / "out", "--quiet")
+    chosen = (*arguments, "--tasks", "0,3,40,60", "--split", "train", "--tier", "expert")
+    code, output, errors = call(*chosen, "--dry-run")
+    assert (code, errors, list(tmp_path.iterdir())) == (0, "", [])
+    assert output == f"{tmp_path}/out: 3 tasks, 3 parts, 18 episodes with 360 steps; nothing written\n"
+    code, output, _ = call(*chosen, "--json")
+    report = json.loads(output)
+    assert (code, report["tasks"], report["episodes"], report["dry_run"]) == (0, 3, 18, False)
+    assert report["files"] == [str(tmp_path / f"out/task_000{task}.hdf5") for task in ("00", "40", "60")]
+    assert_refused(call(*chosen), "out exists and is not empty")
+    assert_refused(call(*arguments, "--tier", "best"), "--tier", "expert")
+    assert_refused(call(*arguments, "--tasks", "0,7-x"), "--tasks", "7-x")
+    assert_refused(call(*arguments, "--tasks", "1"), "no task 1")
+
+
 def test_export_writes_files_and_reports_them(call: Call, tiny: Dataset, tmp_path: Path) -> None:
     code, output, _ = call(
         "export", tiny.folder, "--format", "hdf5", "--snapshots", "last", "--out", tmp_path / "flat", "--json"

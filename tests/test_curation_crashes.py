@@ -10,6 +10,7 @@ import pytest
 from tcmrl_data import (
     Dataset,
     derive_dataset,
+    export_dataset,
     extend_dataset,
     import_dataset,
     merge_datasets,
@@ -21,7 +22,6 @@ from tcmrl_data.curation.remaking import ENGINES
 from tcmrl_data.engine.base import Unit
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import STAGING, remove_abandoned
-from tcmrl_data.interchange.formats.hdf5 import Hdf5Format
 from tcmrl_data.store import tables
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import MANIFEST
@@ -88,7 +88,7 @@ def sources(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Sources:
     seeds = [
         graded_dataset(folder / f"{seed}", seed=seed, scores=scores, tasks=(0, 3)).folder for seed in range(2)
     ]
-    exported, *_ = Hdf5Format().export(open_dataset(seeds[0]), folder / "hdf5")
+    exported, *_ = export_dataset(seeds[0], "hdf5", folder / "hdf5").files
     derive_dataset(tiny, folder / "small", tasks=[0, 99], snapshots="last")
     extend_dataset(folder / "small", out=folder / "extended", episodes=3, workers=2)
     return Sources(seeds, folder / "small", open_dataset(folder / "extended"), exported)

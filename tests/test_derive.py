@@ -333,8 +333,8 @@ def test_a_view_trains_and_exports(graded: Dataset, tmp_path: Path) -> None:
     request = tcmrl_data.BatchRequest(2, {"x": tcmrl_data.Transitions(3)})
     batch = tcmrl_data.open_sampler(view.select(split="train"), request, seed=0).batch(0)
     assert set(batch.task_indices.tolist()) <= {0, 1, 2}
-    files = tcmrl_data.FORMATS.get("hdf5")().export(view, tmp_path / "out", snapshots="tier:expert")
-    assert len(files) >= 4
+    report = tcmrl_data.export_dataset(view, "hdf5", tmp_path / "out", tier="expert")
+    assert len(report.files) >= 4
 
 
 def test_the_command_line_derives(

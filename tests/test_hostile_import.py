@@ -1,6 +1,7 @@
 """A hostile file cannot run code, lead elsewhere, block, take memory or publish anything."""
 
 import gc
+import importlib.util
 import os
 import resource
 import signal
@@ -10,12 +11,15 @@ from types import FrameType
 import pytest
 
 from tcmrl_data import TcmrlError, import_dataset
-from tests.hostile_imports import CASES, FORMATS, Places, hdf5, minari
+from tests.hostile_imports import CASES as WITHOUT_EXTRAS
+from tests.hostile_imports import FORMATS, Places, hdf5, minari
+from tests.hostile_parquet import PARQUET, columns, written
 from tests.made_up import trajectory
 from tests.test_import_idaq import saved
 
 MEMORY_FLOOR, MEMORY_RATIO = 64 * 2**20, 2
 ADDRESS_SPACE = 2**30
+CASES = WITHOUT_EXTRAS | (PARQUET if importlib.util.find_spec("pyarrow") else {})
 SECONDS = 120
 
 
@@ -36,6 +40,9 @@ def _loaded(tmp_path_factory: pytest.TempPathFactory) -> None:
     )
     saved(folder / "d/goal_idx0/trj_evalsample0_step0.npy", trajectory(5, seed=0))
     import_dataset("idaq-npy", [folder / "d"], folder / "three")
+    if CASES.keys() >= PARQUET.keys():
+        (folder / "sound.parquet").write_bytes(written(columns()))
+        import_dataset("parquet", [folder / "sound.parquet"], folder / "four")
 
 
 def ring(number: int, frame: FrameType | None) -> None:

@@ -13,9 +13,8 @@ from tcmrl_cli.frame import run
 
 import tcmrl_algo
 import tcmrl_data
-from tcmrl_data import Dataset, TcmrlError, import_dataset, open_dataset, verify_dataset
+from tcmrl_data import Dataset, TcmrlError, export_dataset, import_dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.errors import BuildError, SimulationError, SnapshotError, StoreError, TaskError
-from tcmrl_data.interchange.formats.hdf5 import Hdf5Format
 from tcmrl_data.store.task_table import TASKS as TASK_TABLE
 from tcmrl_data.verification.repair import repair_dataset
 from tests.conftest import TASKS
@@ -27,7 +26,7 @@ NEVER = np.zeros(6, dtype=bool)
 
 @pytest.fixture(scope="module")
 def exported(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    return Hdf5Format().export(tiny, tmp_path_factory.mktemp("exports") / "hdf5")
+    return list(export_dataset(tiny, "hdf5", tmp_path_factory.mktemp("exports") / "hdf5").files)
 
 
 def rows(**changed: Any) -> dict[str, np.ndarray]:

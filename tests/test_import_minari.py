@@ -7,9 +7,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tcmrl_data import Dataset, import_dataset, open_dataset, verify_dataset
+from tcmrl_data import Dataset, export_dataset, import_dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.formats.minari import MinariFormat, dataset_id
+from tcmrl_data.interchange.formats.minari import dataset_id
 from tests.conftest import TASKS
 from tests.test_interchange import assert_equal
 
@@ -20,7 +20,7 @@ LENGTHS = (4, 3)
 @pytest.fixture(scope="module")
 def exported(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     out = tmp_path_factory.mktemp("exports") / "minari"
-    MinariFormat().export(tiny, out)
+    export_dataset(tiny, "minari", out)
     return [out / dataset_id(tiny, task) for task in TASKS]
 
 

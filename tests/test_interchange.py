@@ -8,10 +8,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from tcmrl_data import Dataset, Trajectory
+from tcmrl_data import Dataset, Trajectory, export_dataset
 from tcmrl_data.foundation.errors import SelectionError, StoreError
 from tcmrl_data.interchange.formats.base import FORMATS
-from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS, Hdf5Format, read_hdf5
+from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS, read_hdf5
 from tests.conftest import TASKS
 from tests.strategies import trajectories
 
@@ -19,7 +19,7 @@ from tests.strategies import trajectories
 @pytest.fixture(scope="module")
 def exported(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("exports") / "flat"
-    Hdf5Format().export(tiny, out)
+    export_dataset(tiny, "hdf5", out)
     return out
 
 
@@ -47,17 +47,20 @@ class TestEveryFormat:
         self, name: str, tiny: Dataset, tmp_path: Path
     ) -> None:
         seen: list[tuple[int, int]] = []
-        files = FORMATS.get(name)().export(
-            tiny, tmp_path / "out", snapshots="last", progress=lambda done, total: seen.append((done, total))
+        report = export_dataset(
+            *(tiny, name, tmp_path / "out"),
+            snapshots="last",
+            progress=lambda done, total: seen.append((done, total)),
         )
         assert seen == [(done, 5) for done in range(1, 6)]
-        assert all(file.is_file() and file.is_relative_to(tmp_path / "out") for file in files)
+        assert (report.tasks, report.parts, report.episodes, report.steps) == (5, 5, 30, 600)
+        assert report.files == tuple(sorted(path for path in (tmp_path / "out").rglob("*") if path.is_file()))
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
     def test_refuses_a_folder_in_use(self, name: str, tiny: Dataset, tmp_path: Path) -> None:
         (tmp_path / "mine").write_text("mine")
         with pytest.raises(StoreError, match="not empty"):
-            FORMATS.get(name)().export(tiny, tmp_path, snapshots="all")
+            export_dataset(tiny, name, tmp_path)
         assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
     def test_a_failure_leaves_nothing(
@@ -72,12 +75,12 @@ class TestEveryFormat:
 
         monkeypatch.setattr(Dataset, "trajectories", fail_late)
         with pytest.raises(StoreError, match="damaged"):
-            FORMATS.get(name)().export(tiny, tmp_path / "out", snapshots="all")
+            export_dataset(tiny, name, tmp_path / "out")
         assert list(tmp_path.iterdir()) == []
 
     def test_refuses_a_rule_that_leaves_nothing(self, name: str, tiny: Dataset, tmp_path: Path) -> None:
         with pytest.raises(SelectionError):
-            FORMATS.get(name)().export(tiny, tmp_path / "out", snapshots="steps>=1000")
+            export_dataset(tiny, name, tmp_path / "out", snapshots="steps>=1000")
         assert list(tmp_path.iterdir()) == []
 
 
@@ -125,7 +128,7 @@ def test_hdf5_says_where_it_comes_from(tiny: Dataset, exported: Path) -> None:
 
 
 def test_hdf5_takes_a_selection_of_snapshots(tiny: Dataset, tmp_path: Path) -> None:
-    Hdf5Format().export(tiny, tmp_path / "last", snapshots="last")
+    export_dataset(tiny, "hdf5", tmp_path / "last", snapshots="last")
     back = read_hdf5(tmp_path / "last" / "task_00000.hdf5")
     for left, right in zip(tiny.trajectories(0, 150), back, strict=True):
         assert_equal(left, right)
@@ -140,7 +143,7 @@ def test_hdf5_round_trip_of_any_episodes(
     out = tmp_path_factory.mktemp("round-trip") / "flat"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Dataset, "trajectories", lambda self, *key: episodes)
-        Hdf5Format().export(tiny, out, snapshots="steps>=100")
+        export_dataset(tiny, "hdf5", out, snapshots="steps>=100")
     for left, right in zip(episodes * 2, read_hdf5(out / "task_00000.hdf5"), strict=True):
         assert_equal(left, right)
     with h5py.File(out / "task_00000.hdf5") as file:

@@ -370,7 +370,7 @@ class Dataset:
                 f"{self.folder}: no {split or 'such'} tasks in the dataset; build some with --tasks"
             )
         parts = {task.index: chosen_parts(self, task.index, rule) for task in chosen}
-        return Selection(self, tuple(chosen), parts, allow_test)
+        return Selection(self, tuple(chosen), parts, allow_test, rule)
 
     def _read_record(self, key: PartKey) -> PartRecord:
         with self.open_part(key) as archive:

@@ -64,12 +64,14 @@ class Selection:
         tasks: the selected tasks.
         parts: task index to the keys of its selected parts.
         allow_test: training may use parts that were made from test tasks.
+        rule: by which the parts were chosen, such as `all` or `tier:medium`.
     """
 
     dataset: "Dataset"
     tasks: tuple[Task, ...]
     parts: dict[int, tuple[PartKey, ...]]
     allow_test: bool = False
+    rule: str = "all"
 
     def trajectories(self, task: int) -> list[Trajectory]:
         """All selected episodes of a task, snapshot by snapshot."""

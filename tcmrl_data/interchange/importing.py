@@ -14,6 +14,7 @@ from tcmrl_data.foundation.errors import StoreError, TaskError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.foundation.records import hidden_text
 from tcmrl_data.foundation.validation import validate_table
+from tcmrl_data.interchange.optional import require_packages
 from tcmrl_data.interchange.readers.base import READERS, Reader, ReadPart, Say, say_nothing
 from tcmrl_data.interchange.readers.source_files import path_digest
 from tcmrl_data.interchange.survey import Survey
@@ -107,6 +108,7 @@ def import_dataset(
 
     Raises:
         UnknownNameError: there is no such reader or environment.
+        MissingPackageError: an optional package of the reader is not installed.
         StoreError: a file is damaged, not of the format, or larger inside than its size justifies; episodes
             do not fit each other or the environment; `out` is in use; a file changes meanwhile.
         TaskError: `tasks` cannot be read.
@@ -121,6 +123,7 @@ def import_dataset(
     if hidden_text([label, licence, url]) is not None:
         raise StoreError("label, licence or url holds control characters; leave them out")
     kind = READERS.get(format_name)
+    require_packages(f"import of {format_name}", kind.optional_packages, kind.extra)
     reader = kind(
         validate_table(kind.Options, options or {}, place=f"import of {format_name}", error=StoreError)
     )

@@ -12,17 +12,17 @@
 """
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, final
 
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.tasks import Task
-from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
-from tcmrl_data.interchange.formats.new_folder import new_folder
+from tcmrl_data.interchange.formats.base import Format
+from tcmrl_data.store.keys import PartKey
 
 
 @final
@@ -31,23 +31,12 @@ class NpzFormat(Format):
 
     name = "npz"
 
-    def export(
-        self,
-        dataset: Dataset,
-        out: Path,
-        *,
-        snapshots: str = "all",
-        progress: ExportProgress = no_progress,
-    ) -> list[Path]:
-        selection = dataset.select(snapshots=snapshots)
-        total, done = sum(map(len, selection.parts.values())), 0
-        names = [f"task_{task.index:05d}.npz" for task in selection.tasks]
-        with new_folder(out) as folder:
-            for task, name in zip(selection.tasks, names, strict=True):
-                np.savez_compressed(folder / name, allow_pickle=False, **_arrays(selection, task))
-                done += len(selection.parts[task.index])
-                progress(done, total)
-        return [out / name for name in names]
+    def place(self, selection: Selection, task: Task) -> str:
+        return f"task_{task.index:05d}.npz"
+
+    def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
+        np.savez_compressed(path, allow_pickle=False, **_arrays(selection, task))
+        yield from selection.parts[task.index]
 
 
 def _arrays(selection: Selection, task: Task) -> dict[str, npt.NDArray[Any]]:

@@ -1,12 +1,14 @@
 """Base class of export formats, which write a dataset for another library."""
 
 import abc
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar
 
-from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.selection import Selection
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.store.keys import PartKey
 
 ExportProgress = Callable[[int, int], None]
 """Called with the number of parts written and of all parts."""
@@ -17,43 +19,41 @@ def no_progress(done: int, total: int) -> None:
 
 
 class Format(abc.ABC):
-    """Writes datasets; a plug-in of the entry point group `tcmrl.formats`, made without arguments.
+    """Writes datasets task by task; a plug-in of the group `tcmrl.formats`, made without arguments.
 
-    Libraries are imported inside `export`, so that other formats work without them.
+    `export_dataset` calls the methods. It stages, syncs and publishes what they write, so that an export
+    appears whole or not at all, and a stopped one goes on behind its last finished task. Libraries are
+    imported inside methods, so that other formats work without them.
     """
 
     name: ClassVar[str]
     optional_packages: ClassVar[tuple[str, ...]] = ()
-    """Modules that `export` imports and that an installation without extras lacks."""
+    """Modules that the methods import and that an installation without extras lacks."""
+    extra: ClassVar[str | None] = None
+    """The extra that brings them, such as `tcmrl[minari]`."""
 
     @abc.abstractmethod
-    def export(
-        self,
-        dataset: Dataset,
-        out: Path,
-        *,
-        snapshots: str = "all",
-        progress: ExportProgress = no_progress,
-    ) -> list[Path]:
-        """Writes a dataset into a new folder, one part in memory at a time.
+    def place(self, selection: Selection, task: Task) -> str:
+        """Path of a task's file or folder within the export, such as `task_00000.hdf5`."""
 
-        The folder appears under its name when all files are complete, and not at all when something fails.
+    @abc.abstractmethod
+    def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
+        """Writes a task, and yields the key of every part when it is written.
 
         Args:
-            dataset: a complete dataset.
-            out: the folder to create; it may exist if it is empty.
-            snapshots: a rule of `Dataset.select`.
-            progress: called as parts are written.
-
-        Returns:
-            The files.
+            selection: `selection.parts[task.index]` are the parts to write, in that order, one in memory at
+                a time.
+            task: one of the selection's.
+            path: a new path that ends in `place(selection, task)`; its parent exists.
 
         Raises:
-            SelectionError: the rule cannot be read or leaves nothing of a task, or the dataset is incomplete.
-            StoreError: `out` exists and is not empty, or the format cannot hold an episode.
+            StoreError: the format cannot hold an episode.
             StorageError: the disk refuses; the message names the file.
-            MissingPackageError: an optional package is not installed.
         """
+
+    def accompanying(self, selection: Selection) -> Mapping[str, bytes]:
+        """Small files beside those of the tasks: path within the export, and content."""
+        return {}
 
 
 FORMATS = Registry("tcmrl.formats", "format", Format)

@@ -12,26 +12,26 @@ Attributes of the file name the environment, the task with its parameters and sp
 dataset it came from.
 """
 
-import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, final
+from typing import TYPE_CHECKING, final
 
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
-from tcmrl_data.interchange.formats.new_folder import new_folder, require_room_for
+from tcmrl_data.interchange.formats.base import Format
+from tcmrl_data.interchange.formats.describing import task_attributes
+from tcmrl_data.interchange.formats.new_folder import require_room_for
+from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
     import h5py
 
-FORMAT_VERSION = 1
+LAYOUT, FORMAT_VERSION = "tcmrl-hdf5", 1
 EPISODE_ARRAYS = ("observations", "actions", "rewards", "terminated", "truncated")
 CHUNK_ROWS = 4_096
 
@@ -42,23 +42,27 @@ class Hdf5Format(Format):
 
     name = "hdf5"
 
-    def export(
-        self,
-        dataset: Dataset,
-        out: Path,
-        *,
-        snapshots: str = "all",
-        progress: ExportProgress = no_progress,
-    ) -> list[Path]:
-        selection = dataset.select(snapshots=snapshots)
-        total = sum(map(len, selection.parts.values()))
-        done = 0
-        with new_folder(out) as folder:
-            for task in selection.tasks:
-                for _ in _write_task(selection, task, folder / _file_name(task)):
-                    done += 1
-                    progress(done, total)
-        return [out / _file_name(task) for task in selection.tasks]
+    def place(self, selection: Selection, task: Task) -> str:
+        return f"task_{task.index:05d}.hdf5"
+
+    def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
+        import h5py
+
+        require_room_for(path)
+        with h5py.File(path, "x") as file:
+            file.attrs.update(task_attributes(selection, task, layout=LAYOUT, version=FORMAT_VERSION))
+            steps = [key.step for key in selection.parts[task.index]]
+            file.attrs["snapshots"] = np.array(steps, dtype=np.int64)
+            groups = file.create_group("episodes")
+            for key in selection.parts[task.index]:
+                trajectories = selection.dataset.trajectories(*key)
+                require_room_for(path, trajectories)
+                first = len(groups)
+                _append(file, flat_arrays(trajectories, first=first, step=key.step))
+                for index, trajectory in enumerate(trajectories, start=first):
+                    _write_episode(groups.create_group(f"{index:06d}"), trajectory, key.step)
+                file.flush()  # what the file keeps in memory is counted as room otherwise
+                yield key
 
 
 def read_hdf5(path: str | Path) -> list[Trajectory]:
@@ -85,49 +89,16 @@ def read_hdf5(path: str | Path) -> list[Trajectory]:
         raise StoreError(f"{path} does not open as HDF5 ({error}); export the dataset again") from None
 
 
-def _file_name(task: Task) -> str:
-    return f"task_{task.index:05d}.hdf5"
+def flat_arrays(
+    trajectories: Sequence[Trajectory], *, first: int, step: int
+) -> dict[str, npt.NDArray[np.generic]]:
+    """Transitions of a part behind one another.
 
-
-def _write_task(selection: Selection, task: Task, path: Path) -> Iterator[int]:
-    """Writes a task part by part; yields the step of every part written."""
-    import h5py
-
-    require_room_for(path)
-    with h5py.File(path, "x") as file:
-        file.attrs.update(_attributes(selection, task))
-        groups = file.create_group("episodes")
-        for key in selection.parts[task.index]:
-            step, trajectories = key.step, selection.dataset.trajectories(*key)
-            require_room_for(path, trajectories)
-            first = len(groups)
-            _append(file, _flat(trajectories, first=first, step=step))
-            for index, trajectory in enumerate(trajectories, start=first):
-                _write_episode(groups.create_group(f"{index:06d}"), trajectory, step)
-            file.flush()  # what the file keeps in memory is counted as room otherwise
-            yield step
-
-
-def _attributes(selection: Selection, task: Task) -> Mapping[str, Any]:
-    manifest = selection.dataset.manifest
-    return {
-        "format": "tcmrl-hdf5",
-        "format_version": FORMAT_VERSION,
-        "environment": manifest.name,
-        "task": task.index,
-        "split": task.split,
-        "parameters": json.dumps(dict(task.parameters), sort_keys=True),
-        "seed": manifest.seed,
-        "snapshots": np.array([key.step for key in selection.parts[task.index]], dtype=np.int64),
-        "dataset_root": manifest.root,
-        "recipe": json.dumps(manifest.recipe.unit_settings(), sort_keys=True),
-        "citation": manifest.recipe.about.citation,
-        "licence": manifest.recipe.about.licence,
-    }
-
-
-def _flat(trajectories: Sequence[Trajectory], *, first: int, step: int) -> dict[str, npt.NDArray[np.generic]]:
-    """Transitions of a part behind one another; `first` numbers its first episode."""
+    Args:
+        trajectories: of the part.
+        first: number of its first episode.
+        step: its snapshot's.
+    """
     lengths = [len(trajectory) for trajectory in trajectories]
     arrays: dict[str, npt.NDArray[np.generic]] = {
         "observations": np.concatenate([trajectory.observations[:-1] for trajectory in trajectories]),

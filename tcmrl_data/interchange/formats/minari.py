@@ -6,7 +6,8 @@ reset, and as metadata its snapshot's step. Further arrays such as `success` are
 more than actions, as Minari has them: the first row is of the reset.
 
 `ref_min_score` is the return of uniform actions; `ref_max_score` that of a controller that knows the task,
-else of the environment's expert, else of the best snapshot, and `ref_max_score_source` says of which.
+else of the environment's expert, else of the best snapshot, and `ref_max_score_source` says of which. Data
+that were imported have neither. The metadata have under `tcmrl` a JSON object that names task and dataset.
 `recover_environment` gives the task back as a Gymnasium environment.
 """
 
@@ -31,15 +32,18 @@ from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import make_environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
-from tcmrl_data.foundation.errors import MissingPackageError, StoreError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
-from tcmrl_data.interchange.formats.base import ExportProgress, Format, no_progress
-from tcmrl_data.interchange.formats.new_folder import new_folder, require_room_for
+from tcmrl_data.interchange.formats.base import Format
+from tcmrl_data.interchange.formats.describing import stored_episodes, task_attributes
+from tcmrl_data.interchange.formats.new_folder import require_room_for
 from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
+LAYOUT, FORMAT_VERSION = "tcmrl-minari", 1
+METADATA_KEY = "tcmrl"
+STEP_ATTRIBUTE = "snapshot_step"
 NEEDED_BY_TASKS = ("tcmrl", "gymnasium", "mujoco", "metaworld")
 """Packages without which a task cannot be made again."""
 
@@ -57,30 +61,43 @@ class MinariFormat(Format):
 
     name = "minari"
     optional_packages = ("minari",)
+    extra = "tcmrl[minari]"
 
-    def export(
-        self,
-        dataset: Dataset,
-        out: Path,
-        *,
-        snapshots: str = "all",
-        progress: ExportProgress = no_progress,
-    ) -> list[Path]:
-        try:
-            import minari  # noqa: F401
-        except ImportError as error:
-            raise MissingPackageError(
-                f"format 'minari' needs a package that is missing ({error}); pip install 'tcmrl[minari]'"
-            ) from None
-        selection = dataset.select(snapshots=snapshots)
-        total = sum(map(len, selection.parts.values()))
-        done = 0
-        with new_folder(out) as folder, _datasets_path(folder):
-            for task in selection.tasks:
-                for _ in _write_task(selection, task, dataset_id(dataset, task.index, snapshots), folder):
-                    done += 1
-                    progress(done, total)
-        return sorted(path for path in out.rglob("*") if path.is_file())
+    def place(self, selection: Selection, task: Task) -> str:
+        return dataset_id(selection.dataset, task.index, selection.rule)
+
+    def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
+        import minari
+
+        dataset, name = selection.dataset, self.place(selection, task)
+        root = path.parents[name.count("/")]
+        require_room_for(path.with_name("namespace_metadata.json"))
+        with _datasets_path(root):
+            with warnings.catch_warnings():
+                warnings.filterwarnings("ignore", ".* (is set to|is) None", UserWarning)  # what is unknown
+                written = minari.create_dataset_from_buffers(name, [], **_description(selection, task))
+            source, _ = _best(dataset.references(task.index))
+            attributes = task_attributes(selection, task, layout=LAYOUT, version=FORMAT_VERSION)
+            written.storage.update_metadata(
+                {"ref_max_score_source": source, METADATA_KEY: json.dumps(attributes)}
+            )
+            for key in selection.parts[task.index]:
+                trajectories = stored_episodes(dataset, key, format_name="Minari")
+                require_room_for(path / "data" / "main_data.hdf5", trajectories)
+                first = written.total_episodes
+                written.update_dataset_from_buffer(
+                    [_buffer(dataset, key, index, episode) for index, episode in enumerate(trajectories)]
+                )
+                written.storage.update_episode_metadata(
+                    [{STEP_ATTRIBUTE: key.step}] * len(trajectories),
+                    range(first, first + len(trajectories)),
+                )
+                yield key
+
+    def accompanying(self, selection: Selection) -> Mapping[str, bytes]:
+        namespace = Path(self.place(selection, selection.tasks[0])).parent
+        folders = [folder for folder in (namespace, *namespace.parents) if folder.name]
+        return {f"{folder}/namespace_metadata.json": b"{}" for folder in folders}
 
 
 def dataset_id(dataset: Dataset, task: int, snapshots: str = "all") -> str:
@@ -129,39 +146,18 @@ def _datasets_path(folder: Path) -> Iterator[None]:
             os.environ["MINARI_DATASETS_PATH"] = before
 
 
-def _write_task(selection: Selection, task: Task, name: str, folder: Path) -> Iterator[int]:
-    """Writes a task part by part; yields the step of every part written."""
-    import minari
-
-    dataset = selection.dataset
-    require_room_for(folder / "namespace_metadata.json")
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "`.*` is set to None", UserWarning)  # author and link are unknown
-        written = minari.create_dataset_from_buffers(name, [], **_description(selection, task))
-    source, _ = _best(dataset.references(task.index))
-    written.storage.update_metadata({"ref_max_score_source": source, "dataset_root": dataset.manifest.root})
-    for key in selection.parts[task.index]:
-        trajectories = dataset.trajectories(*key)
-        require_room_for(folder / name / "data" / "main_data.hdf5", trajectories)
-        first = written.total_episodes
-        written.update_dataset_from_buffer(
-            [_buffer(dataset, key, index, trajectory) for index, trajectory in enumerate(trajectories)]
-        )
-        written.storage.update_episode_metadata(
-            [{"snapshot_step": key.step}] * len(trajectories), range(first, first + len(trajectories))
-        )
-        yield key.step
-
-
 def _description(selection: Selection, task: Task) -> dict[str, Any]:
     """Metadata of a task's Minari dataset."""
     dataset = selection.dataset
     environment, recipe = dataset.environment, dataset.manifest.recipe
-    spec = EnvSpec(
-        id=f"tcmrl/{dataset.name.replace('/', '-')}-task{task.index:05d}-v0",
-        entry_point=f"{__name__}:{make_task.__name__}",
-        kwargs={"settings": recipe.environment.model_dump(mode="json"), "parameters": dict(task.parameters)},
-    )
+    spec = None
+    if type(environment).members():  # otherwise only its data are known
+        settings = recipe.environment.model_dump(mode="json")
+        spec = EnvSpec(
+            id=f"tcmrl/{dataset.name.replace('/', '-')}-task{task.index:05d}-v0",
+            entry_point=f"{__name__}:{make_task.__name__}",
+            kwargs={"settings": settings, "parameters": dict(task.parameters)},
+        )
     references = dataset.references(task.index)
     platform = dataset.manifest.platforms[dataset.entry(selection.parts[task.index][0]).platform]
     packages = {"tcmrl": version("tcmrl"), **platform.packages}
@@ -172,7 +168,7 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
         "action_space": Box(-1.0, 1.0, (environment.action_dim,), np.float32),
         "algorithm_name": recipe.behavior.source,
         "ref_min_score": references.uniform,
-        "ref_max_score": _best(references)[1],
+        "ref_max_score": None if references.uniform is None else _best(references)[1],
         "num_episodes_average_score": recipe.rollouts.episodes,
         "requirements": [
             f"{package}=={packages[package]}" for package in NEEDED_BY_TASKS if package in packages
@@ -198,11 +194,6 @@ def _best(references: TaskReferences) -> tuple[str, float]:
 def _buffer(dataset: Dataset, key: PartKey, episode: int, trajectory: Trajectory) -> "EpisodeBuffer":
     from minari.data_collector import EpisodeBuffer
 
-    if not len(trajectory):
-        raise StoreError(
-            f"{dataset.file_of(key)}: episode {episode} has no steps, which Minari cannot "
-            "hold; export with --format hdf5"
-        )
     seed = dataset.part(*key).identity.seed
     return EpisodeBuffer(
         seed=None

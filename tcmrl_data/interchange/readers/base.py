@@ -10,7 +10,10 @@ from pydantic import BaseModel, ConfigDict
 
 from tcmrl_data.envs.tasks import Split
 from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.canonical import parse_json
+from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.store.limits import MAX_INDEX
 
 Say = Callable[[str], None]
 """Takes what a user should know of a file, such as episodes that were cut."""
@@ -26,6 +29,21 @@ class ReaderOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
+class ObservationOptions(ReaderOptions):
+    """Options of readers whose files may hold observations in several arrays.
+
+    Attributes:
+        observation_keys: names of the arrays that are put side by side, separated by commas; all that are
+            rows of numbers, sorted by name, where unset.
+    """
+
+    observation_keys: str | None = None
+
+    def keys(self) -> tuple[str, ...] | None:
+        """The names, in order; None where unset."""
+        return None if self.observation_keys is None else tuple(self.observation_keys.split(","))
+
+
 @dataclass(frozen=True)
 class FileTask:
     """What a file says of a task.
@@ -37,6 +55,36 @@ class FileTask:
 
     split: Split | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict)
+
+
+TASK_ATTRIBUTES = ("format_version", "task", "split", "parameters")
+"""What `described_task` reads of the attributes that exports write."""
+
+
+def described_task(attributes: Any, *, version: int, place: str) -> tuple[int, FileTask]:
+    """Index and description of the task that an exported file names.
+
+    Args:
+        attributes: numbers and texts by name, or JSON text of them.
+        version: of the format, which is read here.
+        place: the file, for error messages.
+
+    Raises:
+        StoreError: the file is of another version, or the attributes describe no task.
+    """
+    try:
+        found = parse_json(attributes.encode()) if isinstance(attributes, str) else attributes
+        written, index, split, text = (found[name] for name in TASK_ATTRIBUTES)
+        parameters: Any = parse_json(text.encode())
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise StoreError(f"{place}: its attributes do not describe a task") from None
+    if written != version:
+        raise StoreError(f"{place}: format_version {repr(written)[:40]} is not {version}, which is read here")
+    if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < MAX_INDEX:
+        raise StoreError(f"{place}: task is {repr(index)[:40]}, not an index")
+    if not isinstance(parameters, dict) or split not in ("train", "test"):
+        raise StoreError(f"{place}: parameters and split are not those of a task")
+    return index, FileTask("test" if split == "test" else "train", parameters)
 
 
 @dataclass(frozen=True)
@@ -63,6 +111,10 @@ class Reader(abc.ABC):
     """
 
     name: ClassVar[str]
+    optional_packages: ClassVar[tuple[str, ...]] = ()
+    """Modules that the methods import and that an installation without extras lacks."""
+    extra: ClassVar[str | None] = None
+    """The extra that brings them, such as `tcmrl[parquet]`."""
     Options: ClassVar[type[ReaderOptions]] = ReaderOptions
 
     def __init__(self, options: ReaderOptions | None = None) -> None:

@@ -168,6 +168,24 @@ def episode(
     return made
 
 
+def joined_observations(observations: Array, following: Array, *, place: str) -> Array:
+    """The observations of an episode, (T + 1, observation_dim), from those before and after every step.
+
+    Raises:
+        StoreError: other shapes, or a row that does not begin where the row before it ends.
+    """
+    if observations.ndim != 2 or observations.shape != following.shape or not len(following):
+        raise StoreError(
+            f"{place}: observations before and after the steps have shapes {observations.shape} and "
+            f"{following.shape}"
+        )
+    if (following[:-1] != observations[1:]).any():
+        raise StoreError(
+            f"{place}: a row does not begin with the observation in which the row before it ends"
+        )
+    return np.concatenate([observations, following[-1:]])
+
+
 def last_flags(terminated: Array, truncated: Array | None, place: str) -> tuple[bool, bool]:
     """The flags of an episode's last step.
 

@@ -10,21 +10,22 @@ terminations, as robomimic's own algorithms do; one before the last step of a de
 import re
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Literal, final
-
-import numpy as np
-import numpy.typing as npt
+from typing import Literal, final
 
 from tcmrl_data.envs.trajectory import Trajectory
-from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS, FORMAT_VERSION
+from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS, FORMAT_VERSION, LAYOUT
+from tcmrl_data.interchange.formats.robomimic import FORMAT_VERSION as ROBOMIMIC_VERSION
+from tcmrl_data.interchange.formats.robomimic import LAYOUT as OUR_ROBOMIMIC
+from tcmrl_data.interchange.formats.robomimic import STEP_ATTRIBUTE
 from tcmrl_data.interchange.readers.base import (
+    TASK_ATTRIBUTES,
     FileTask,
+    ObservationOptions,
     Reader,
-    ReaderOptions,
     ReadPart,
     Say,
+    described_task,
     say_nothing,
 )
 from tcmrl_data.interchange.readers.episodes import (
@@ -32,33 +33,31 @@ from tcmrl_data.interchange.readers.episodes import (
     episode,
     episodes_of_rows,
     extras_of,
+    joined_observations,
     last_flags,
     parts_by_step,
 )
 from tcmrl_data.interchange.readers.hdf5_file import Hdf5File
 from tcmrl_data.interchange.readers.source_files import require_file
-from tcmrl_data.store.limits import MAX_INDEX
 
 Layout = Literal["tcmrl", "d4rl", "robomimic"]
 D4RL_ARRAYS = ("observations", "actions", "rewards", "terminals")
 D4RL_OPTIONAL = ("timeouts", "next_observations")
+OUR_DEMONSTRATION = ("actions", "rewards", "dones", "terminated", "truncated")
 ROBOMIMIC_FLAGS = ("terminated", "truncated", "dones")
 """The first two are not robomimic's own, but say what `dones` leaves open."""
 
 _DEMO = re.compile(r"demo_([0-9]{1,9})")
 
 
-class Hdf5Options(ReaderOptions):
-    """Options of the HDF5 reader.
+class Hdf5Options(ObservationOptions):
+    """Options of the HDF5 reader; `observation_keys` are those of robomimic's layout.
 
     Attributes:
         layout: of the file, instead of the one that its content suggests.
-        observation_keys: robomimic's low-dimensional observations that are put side by side, separated by
-            commas; all of rank 2, sorted by name, where unset.
     """
 
     layout: Layout | None = None
-    observation_keys: str | None = None
 
 
 @final
@@ -89,12 +88,17 @@ class Hdf5Reader(Reader):
         names.sort(key=lambda name: int(name.removeprefix("demo_")))
         if not names:
             raise StoreError(f"{file.path}: /data holds no demo_0")
-        wanted = self.options.observation_keys
-        keys = tuple(wanted.split(",")) if wanted else _low_dimensional(file, f"/data/{names[0]}/obs")
-        trajectories = [
-            trajectory for name in names for trajectory in _demonstration(file, f"/data/{name}", keys, cuts)
-        ]
-        yield ReadPart(None, 0, trajectories)
+        keys = self.options.keys() or _low_dimensional(file, f"/data/{names[0]}/obs")
+        is_ours = file.attribute("/", "format") == OUR_ROBOMIMIC
+        task, about = _task(file, ROBOMIMIC_VERSION) if is_ours else (None, FileTask())
+        read = _our_demonstration if is_ours else _demonstration
+        episodes = (
+            (file.index(f"/data/{name}", STEP_ATTRIBUTE) if is_ours else 0, trajectory)
+            for name in names
+            for trajectory in read(file, f"/data/{name}", keys, cuts)
+        )
+        for step, trajectories in parts_by_step(episodes, place=str(file.path)):
+            yield ReadPart(task, step, trajectories, about)
 
 
 def _layout_of(file: Hdf5File) -> Layout:
@@ -103,7 +107,7 @@ def _layout_of(file: Hdf5File) -> Layout:
     Raises:
         StoreError: none of the three.
     """
-    if file.attribute("/", "format") == "tcmrl-hdf5":
+    if file.attribute("/", "format") == LAYOUT:
         return "tcmrl"
     if all(file.holds(f"/{name}") for name in D4RL_ARRAYS):
         return "d4rl"
@@ -117,12 +121,9 @@ def _layout_of(file: Hdf5File) -> Layout:
 
 
 def _read_ours(file: Hdf5File, cuts: Cuts) -> Iterator[ReadPart]:
-    version = file.attribute("/", "format_version")
-    if version != FORMAT_VERSION:
-        raise StoreError(f"{file.path}: format_version {version} is not {FORMAT_VERSION}, which is read here")
-    task, about = _index(file, "/", "task"), _about(file)
+    task, about = _task(file, FORMAT_VERSION)
     groups = (f"/episodes/{name}" for name in file.members("/episodes"))
-    episodes = ((_index(file, group, "step"), _our_episode(file, group, cuts)) for group in groups)
+    episodes = ((file.index(group, "step"), _our_episode(file, group, cuts)) for group in groups)
     for step, trajectories in parts_by_step(episodes, place=str(file.path)):
         yield ReadPart(task, step, trajectories, about)
 
@@ -139,22 +140,10 @@ def _our_episode(file: Hdf5File, group: str, cuts: Cuts) -> Trajectory:
     return episode(observations, actions, rewards, ended=ended, extras=extras, cuts=cuts, place=place)
 
 
-def _index(file: Hdf5File, path: str, name: str) -> int:
-    value = file.attribute(path, name)
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < MAX_INDEX:
-        raise StoreError(f"{file.path}: {path} attribute {name} is {repr(value)[:40]}, not an index")
-    return value
-
-
-def _about(file: Hdf5File) -> FileTask:
-    text, split = file.attribute("/", "parameters"), file.attribute("/", "split")
-    try:
-        parameters: Any = parse_json(text.encode())
-    except (ValueError, AttributeError):
-        parameters = None
-    if not isinstance(parameters, dict) or split not in ("train", "test"):
-        raise StoreError(f"{file.path}: attributes parameters and split are not those of a task")
-    return FileTask("test" if split == "test" else "train", parameters)
+def _task(file: Hdf5File, version: int) -> tuple[int, FileTask]:
+    """The task that the attributes of an exported file name."""
+    attributes = {name: file.attribute("/", name) for name in TASK_ATTRIBUTES}
+    return described_task(attributes, version=version, place=str(file.path))
 
 
 def _read_d4rl(file: Hdf5File, cuts: Cuts) -> Iterator[ReadPart]:
@@ -181,26 +170,45 @@ def _low_dimensional(file: Hdf5File, group: str) -> tuple[str, ...]:
 
 
 def _demonstration(file: Hdf5File, group: str, keys: tuple[str, ...], cuts: Cuts) -> list[Trajectory]:
-    def observations(kind: str) -> npt.NDArray[Any]:
-        columns = [file.array(f"{group}/{kind}/{key}") for key in keys]
-        for key, column in zip(keys, columns, strict=True):
-            if column.ndim != 2 or len(column) != len(columns[0]):
-                raise StoreError(f"{file.path}: {group}/{kind}/{key} has shape {column.shape}")
-        return np.concatenate(columns, axis=1)
-
     flags = {name: file.array(f"{group}/{name}") for name in ROBOMIMIC_FLAGS if file.holds(f"{group}/{name}")}
     terminals = flags.get("terminated", flags.get("dones"))
     if terminals is None:
         raise StoreError(f"{file.path}: {group}/dones is missing")
     terminals = terminals.reshape(-1) != 0
     terminals[:-1] = False
+    has_next = file.is_group(f"{group}/next_obs")
     return episodes_of_rows(
-        observations=observations("obs"),
+        observations=file.columns(f"{group}/obs", keys),
         actions=file.array(f"{group}/actions"),
         rewards=file.array(f"{group}/rewards"),
         terminals=terminals,
         timeouts=flags.get("truncated"),
-        next_observations=observations("next_obs") if file.is_group(f"{group}/next_obs") else None,
+        next_observations=file.columns(f"{group}/next_obs", keys) if has_next else None,
         cuts=cuts,
         place=f"{file.path}: {group}",
     )
+
+
+def _our_demonstration(
+    file: Hdf5File, group: str, keys: tuple[str, ...], cuts: Cuts
+) -> tuple[Trajectory, ...]:
+    """A demonstration that `RobomimicFormat` wrote, with its flags and further arrays."""
+    place = f"{file.path}: {group}"
+    arrays = {
+        name: file.array(f"{group}/{name}") for name in file.members(group) if file.rank(f"{group}/{name}")
+    }
+    missing = [name for name in OUR_DEMONSTRATION if name not in arrays]
+    if missing:
+        raise StoreError(f"{place}/{missing[0]} is missing")
+    actions, rewards, _, terminated, truncated = (arrays.pop(name) for name in OUR_DEMONSTRATION)
+    both = (file.columns(f"{group}/{name}", keys) for name in ("obs", "next_obs"))
+    made = episode(
+        joined_observations(*both, place=place),
+        actions,
+        rewards,
+        ended=last_flags(terminated, truncated, place),
+        extras=extras_of(arrays),
+        cuts=cuts,
+        place=place,
+    )
+    return (made,)

@@ -8,7 +8,7 @@ their dataset declares: the library would unpack whatever they hold.
 import contextlib
 import os
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -20,6 +20,7 @@ import numpy.typing as npt
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, printable
 from tcmrl_data.interchange.readers.source_files import decoded_limit, require_file
+from tcmrl_data.store.limits import MAX_INDEX
 
 MOST_MEMBERS = 2**20
 LARGEST_ATTRIBUTE = 2**20
@@ -104,6 +105,26 @@ class Hdf5File:
                 raise ValueError(f"is of type {opened.dtype}")
             value = found.attrs[name]
             return value.decode() if isinstance(value, bytes) else value if is_text else value.item()
+
+    def index(self, path: str, name: str, default: int | None = None) -> int:
+        """An attribute that is a task's index or a snapshot's step; the default where there is none."""
+        value = self.attribute(path, name)
+        if value is None and default is not None:
+            return default
+        if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < MAX_INDEX:
+            raise StoreError(f"{self.path}: {path} attribute {name} is {repr(value)[:40]}, not an index")
+        return value
+
+    def columns(self, group: str, keys: Sequence[str]) -> npt.NDArray[Any]:
+        """Datasets of a group side by side, as (rows, columns); those of rank 1 are one column."""
+        members = [self.array(f"{group}/{key}") for key in keys]
+        members = [member[:, None] if member.ndim == 1 else member for member in members]
+        if not members or any(member.ndim != 2 or len(member) != len(members[0]) for member in members):
+            raise StoreError(
+                f"{self.path}: {group} holds no rows of equal number; choose its members by --option "
+                "observation_keys=A,B"
+            )
+        return np.concatenate(members, axis=1)
 
     def rank(self, path: str) -> int | None:
         """Number of dimensions of a dataset; None where there is none."""

@@ -8,45 +8,32 @@ Datasets that `tcmrl-data export --format minari` wrote say task, parameters and
 """
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, final
 
-import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
+from tcmrl_data.interchange.formats.minari import FORMAT_VERSION, METADATA_KEY, STEP_ATTRIBUTE
 from tcmrl_data.interchange.readers.base import (
     FileTask,
+    ObservationOptions,
     Reader,
-    ReaderOptions,
     ReadPart,
     Say,
+    described_task,
     say_nothing,
 )
 from tcmrl_data.interchange.readers.episodes import Cuts, episode, extras_of, last_flags, parts_by_step
 from tcmrl_data.interchange.readers.hdf5_file import Hdf5File
 from tcmrl_data.interchange.readers.source_files import require_own_file
-from tcmrl_data.store.limits import MAX_INDEX
 
 METADATA, CONTENT = "metadata.json", "main_data.hdf5"
-STEP_ATTRIBUTE = "snapshot_step"
 _EPISODE = re.compile(r"episode_([0-9]{1,9})")
-_TASK = re.compile(r"tcmrl/.+-task([0-9]{5,9})-v0")
-
-
-class MinariOptions(ReaderOptions):
-    """Options of the Minari reader.
-
-    Attributes:
-        observation_keys: of a dictionary of observations, those that are put side by side, separated by
-            commas; all, sorted by name, where unset.
-    """
-
-    observation_keys: str | None = None
 
 
 @final
@@ -54,8 +41,8 @@ class MinariReader(Reader):
     """A path is the folder of a dataset, such as `~/.minari/datasets/mujoco/hopper/medium-v0`."""
 
     name = "minari"
-    Options = MinariOptions
-    options: MinariOptions
+    Options = ObservationOptions
+    options: ObservationOptions
 
     def files(self, path: Path) -> list[Path]:
         files = [_data_folder(path) / name for name in (CONTENT, METADATA)]
@@ -65,12 +52,15 @@ class MinariReader(Reader):
 
     def read(self, path: Path, say: Say = say_nothing) -> Iterator[ReadPart]:
         content, metadata = self.files(path)
-        task, about = _task(_metadata(metadata))
+        task, about = _task(_metadata(metadata), metadata)
         cuts = Cuts()
         with Hdf5File(content) as file:
             names = [name for name in file.members("/") if _EPISODE.fullmatch(name)]
             names.sort(key=lambda name: int(name.removeprefix("episode_")))
-            episodes = ((_step(file, name), self._episode(file, f"/{name}", cuts)) for name in names)
+            episodes = (
+                (file.index(f"/{name}", STEP_ATTRIBUTE, 0), self._episode(file, f"/{name}", cuts))
+                for name in names
+            )
             for step, trajectories in parts_by_step(episodes, place=str(content)):
                 yield ReadPart(task, step, trajectories, about)
         for sentence in cuts.sentences():
@@ -79,9 +69,8 @@ class MinariReader(Reader):
     def _episode(self, file: Hdf5File, group: str, cuts: Cuts) -> Trajectory:
         place = f"{file.path}: {group}"
         flags = last_flags(file.array(f"{group}/terminations"), file.array(f"{group}/truncations"), place)
-        keys = self.options.observation_keys
         return episode(
-            _columns(file, f"{group}/observations", keys.split(",") if keys else None),
+            _columns(file, f"{group}/observations", self.options.keys()),
             _columns(file, f"{group}/actions", None),
             file.array(f"{group}/rewards"),
             ended=flags,
@@ -121,37 +110,17 @@ def _metadata(file: Path) -> Mapping[str, Any]:
     return values
 
 
-def _task(metadata: Mapping[str, Any]) -> tuple[int | None, FileTask]:
+def _task(metadata: Mapping[str, Any], file: Path) -> tuple[int | None, FileTask]:
     """The task of a dataset that was exported here; nothing for any other."""
-    try:
-        spec = parse_json(metadata["env_spec"].encode())
-        index = int(_TASK.fullmatch(spec["id"])[1])  # type: ignore[index]
-        parameters = spec["kwargs"]["parameters"]
-    except (ValueError, KeyError, TypeError, AttributeError):
+    text = metadata.get(METADATA_KEY)
+    if text is None:
         return None, FileTask()
-    return (index, FileTask(parameters=parameters)) if isinstance(parameters, dict) else (None, FileTask())
+    return described_task(text, version=FORMAT_VERSION, place=str(file))
 
 
-def _step(file: Hdf5File, name: str) -> int:
-    value = file.attribute(f"/{name}", STEP_ATTRIBUTE)
-    if value is None:
-        return 0
-    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < MAX_INDEX:
-        raise StoreError(f"{file.path}: /{name} attribute {STEP_ATTRIBUTE} is {repr(value)[:40]}, not a step")
-    return value
-
-
-def _columns(file: Hdf5File, path: str, keys: list[str] | None) -> npt.NDArray[Any]:
+def _columns(file: Hdf5File, path: str, keys: Sequence[str] | None) -> npt.NDArray[Any]:
     """An array of (rows, columns), or those of a group side by side."""
-    if not file.is_group(path):
-        return file.array(path)
-    members = [file.array(f"{path}/{key}") for key in keys or file.members(path)]
-    members = [member[:, None] if member.ndim == 1 else member for member in members]
-    if not members or any(member.ndim != 2 or len(member) != len(members[0]) for member in members):
-        raise StoreError(
-            f"{file.path}: {path} is no flat dictionary of rows; choose some by --option observation_keys=A,B"
-        )
-    return np.concatenate(members, axis=1)
+    return file.columns(path, keys or file.members(path)) if file.is_group(path) else file.array(path)
 
 
 def _infos(file: Hdf5File, group: str) -> dict[str, npt.NDArray[Any]]:

@@ -1,0 +1,395 @@
+"""Exports: what goes out comes back, other programs' rules find it, and a stopped export goes on."""
+
+import json
+import pickletools
+import shutil
+import weakref
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from tcmrl_data import FORMATS, Dataset, Trajectory, export_dataset, import_dataset, open_dataset
+from tcmrl_data.foundation.disk import lock_file
+from tcmrl_data.foundation.errors import LockedError, SelectionError, StoreError, TaskError
+from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS
+from tcmrl_data.interchange.formats.new_folder import LOCK, staging_folder
+from tests.conftest import TASKS
+from tests.test_adapters import terminated_early
+from tests.test_interchange import assert_equal
+
+READERS = {
+    "hdf5": "hdf5",
+    "idaq-npy": "idaq-npy",
+    "minari": "minari",
+    "parquet": "parquet",
+    "robomimic": "hdf5",
+}
+FLAGLESS = ("idaq-npy",)
+"""Formats that hold neither flags nor further arrays."""
+
+
+def exported(dataset: Dataset, name: str, out: Path, **selection: Any) -> tuple[Path, ...]:
+    """Exports a dataset, unless a package is missing."""
+    for package in FORMATS.get(name).optional_packages:
+        pytest.importorskip(package)
+    return export_dataset(dataset, name, out, **selection).files
+
+
+def sources(name: str, out: Path, files: Sequence[Path]) -> list[Path]:
+    """What an import of an export is given."""
+    if name == "idaq-npy":
+        return [out]
+    return [file.parents[1] for file in files if file.name == "main_data.hdf5"] or list(files)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_what_was_exported_comes_back(
+    name: str, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Episodes of 20 to 15 steps, half of them terminated."""
+    out = tmp_path / "out"
+    with monkeypatch.context() as patch:
+        patch.setattr(Dataset, "trajectories", terminated_early(Dataset.trajectories))
+        files = exported(tiny, name, out, tasks=[0, 3], snapshots="steps>=100")
+        expected = {key: tiny.trajectories(*key) for key in tiny.parts if key.task < 4 and key.step}
+    tasks = out / "tasks.json" if name == "idaq-npy" else None
+    report = import_dataset(READERS[name], sources(name, out, files), tmp_path / "back", tasks=tasks)
+    back = open_dataset(tmp_path / "back")
+    assert [(task.index, task.split, task.parameters) for task in back.tasks] == [
+        (task.index, task.split, task.parameters) for task in tiny.tasks[:2]
+    ]
+    assert list(back.parts) == list(expected)
+    for key, originals in expected.items():
+        for found, original in zip(back.trajectories(*key), originals, strict=True):
+            if name in FLAGLESS:
+                for array in ("observations", "actions", "rewards"):
+                    np.testing.assert_array_equal(getattr(found, array), getattr(original, array))
+                assert (found.terminated.any(), found.truncated[-1]) == (False, True)
+            else:
+                assert_equal(found, original)
+    assert bool(report.notes) == (name in FLAGLESS)
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_an_imported_dataset_is_exported_too(name: str, imported: Dataset, tmp_path: Path) -> None:
+    """It has no seed, no policies, no reference returns and no environment."""
+    files = exported(imported, name, tmp_path / "out")
+    report = import_dataset(READERS[name], sources(name, tmp_path / "out", files), tmp_path / "back")
+    assert (report.tasks, report.episodes, report.steps) == (2, 12, 240)
+
+
+@pytest.fixture(scope="module")
+def imported(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("imported")
+    files = export_dataset(tiny, "hdf5", folder / "hdf5", tasks=[0, 3], snapshots="last").files
+    import_dataset("hdf5", files, folder / "data")
+    return open_dataset(folder / "data")
+
+
+def test_files_are_found_and_read_by_the_rules_of_the_published_loaders(
+    tiny: Dataset, tmp_path: Path
+) -> None:
+    """`init_buffer` of FOCAL, IDAQ and TCMRL (rlkit/core/rl_algorithm.py): names, columns, float64."""
+    export_dataset(tiny, "idaq-npy", tmp_path / "data")
+    for step in (100, 150):  # `train_epoch`
+        for task in TASKS:
+            expected = tiny.trajectories(task, step)
+            for number in range(6):  # `n_trj`
+                (file,) = (tmp_path / "data").glob(f"goal_idx{task}/trj_evalsample{number}_step{step}.npy")
+                rows = np.load(file, allow_pickle=True)
+                assert rows.shape == (20, 4)
+                buffers = [np.zeros((20, 2)), np.zeros((20, 2)), np.zeros((20, 1)), np.zeros((20, 2))]
+                for index in range(len(rows)):
+                    for buffer, column in zip(buffers, range(4), strict=True):
+                        buffer[index] = rows[:, column][index]
+                original = expected[number]
+                np.testing.assert_array_equal(buffers[0], original.observations[:-1])
+                np.testing.assert_array_equal(buffers[1], original.actions)
+                np.testing.assert_array_equal(buffers[2][:, 0], original.rewards)
+                np.testing.assert_array_equal(buffers[3], original.observations[1:])
+    assert len(list((tmp_path / "data").glob("goal_idx*"))) == len(TASKS)
+
+
+def test_pickled_rows_name_what_every_numpy_has(tiny: Dataset, tmp_path: Path) -> None:
+    """NumPy 2 itself would name `numpy._core`, which the NumPy of the published code lacks."""
+    export_dataset(tiny, "idaq-npy", tmp_path / "data", tasks=[0], snapshots="last")
+    content = (tmp_path / "data/goal_idx0/trj_evalsample0_step150.npy").read_bytes()
+    operations = list(pickletools.genops(content[128:]))
+    names = {argument for operation, argument, _ in operations if operation.name == "GLOBAL"}
+    assert names == {"numpy.core.multiarray _reconstruct", "numpy ndarray", "numpy dtype"}
+    assert max(operation.proto for operation, _, _ in operations) <= 3
+
+
+def test_robomimics_layout_is_complete(tiny: Dataset, tmp_path: Path) -> None:
+    """Every group, dataset and attribute of https://robomimic.github.io/docs/datasets/overview.html."""
+    export_dataset(tiny, "robomimic", tmp_path / "out", tasks=[3])
+    expected = tiny.select(tasks=[3]).trajectories(3)
+    with h5py.File(tmp_path / "out/task_00003.hdf5") as file:
+        data = file["data"]
+        assert data.attrs["total"] == 360
+        environment = json.loads(data.attrs["env_args"])
+        assert (environment["env_name"], environment["type"]) == ("point-robot", 2)
+        assert set(data) == {f"demo_{number}" for number in range(18)}
+        for number, original in enumerate(expected):
+            demonstration = data[f"demo_{number}"]
+            assert demonstration.attrs["num_samples"] == len(original)
+            np.testing.assert_array_equal(demonstration["obs/flat"], original.observations[:-1])
+            np.testing.assert_array_equal(demonstration["next_obs/flat"], original.observations[1:])
+            np.testing.assert_array_equal(demonstration["actions"], original.actions)
+            np.testing.assert_array_equal(demonstration["rewards"], original.rewards)
+            np.testing.assert_array_equal(demonstration["dones"], original.terminated.astype(int))
+        masks = {name: [member.decode() for member in mask[:]] for name, mask in file["mask"].items()}
+    names = [f"demo_{number}" for number in range(18)]
+    assert masks == {
+        "test": names,
+        "step_0": names[:6],
+        "step_100": names[6:12],
+        "step_150": names[12:],
+    }
+
+
+def test_pyarrow_reads_one_table_of_all_files(tiny: Dataset, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    files = export_dataset(tiny, "parquet", tmp_path / "out", split="train").files
+    table = parquet.read_table(tmp_path / "out")
+    assert table.num_rows == 4 * 360
+    one = parquet.read_table(files[1])
+    expected = tiny.select(tasks=[40]).trajectories(40)
+    for column, rows in {
+        "observation": np.concatenate([episode.observations[:-1] for episode in expected]),
+        "next_observation": np.concatenate([episode.observations[1:] for episode in expected]),
+        "action": np.concatenate([episode.actions for episode in expected]),
+        "reward": np.concatenate([episode.rewards for episode in expected]),
+        "truncated": np.concatenate([episode.truncated for episode in expected]),
+        "episode": np.repeat(np.arange(18), 20),
+        "time": np.tile(np.arange(20), 18),
+        "step": np.repeat([0, 100, 150], 120),
+    }.items():
+        np.testing.assert_array_equal(np.array(one.column(column).to_pylist(), rows.dtype), rows)
+    assert one.column("run").unique().to_pylist() == ["main"]
+    assert json.loads(one.schema.metadata[b"tcmrl"])["split"] == "train"
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_every_format_takes_a_selection(name: str, tiny: Dataset, tmp_path: Path) -> None:
+    files = exported(tiny, name, tmp_path / "out", tasks=[0, 3, 40], split="train", tier="expert")
+    selection = tiny.select(tasks=[0, 3, 40], split="train", tier="expert")
+    report = import_dataset(READERS[name], sources(name, tmp_path / "out", files), tmp_path / "back")
+    keys = [key for keys in selection.parts.values() for key in keys]
+    assert list(open_dataset(tmp_path / "back").parts) == keys
+    assert (report.tasks, {key.task for key in keys}) == (2, {0, 40})
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_one_part_at_a_time_is_in_memory(
+    name: str, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Episodes(list[Trajectory]):
+        """A list that can be watched."""
+
+    alive: weakref.WeakSet[Episodes] = weakref.WeakSet()
+    most = 0
+    original = Dataset.trajectories
+
+    def watched(self: Dataset, *key: Any) -> Episodes:
+        nonlocal most
+        made = Episodes(original(self, *key))
+        alive.add(made)
+        most = max(most, len(alive))
+        return made
+
+    Episodes.__hash__ = lambda self: id(self)  # type: ignore[method-assign]
+    monkeypatch.setattr(Dataset, "trajectories", watched)
+    exported(tiny, name, tmp_path / "out")
+    assert most <= 2  # the one before, until the next is bound to its name
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_an_interrupted_export_goes_on_behind_its_last_finished_task(
+    name: str, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    straight = exported(tiny, name, tmp_path / "straight", snapshots="last")
+    read: list[int] = []
+    original = Dataset.trajectories
+
+    def stopping(self: Dataset, task: int, step: int, run: str = "main") -> list[Trajectory]:
+        if task == 40 and 40 not in read:
+            read.append(task)
+            raise KeyboardInterrupt
+        read.append(task)
+        return original(self, task, step, run)
+
+    monkeypatch.setattr(Dataset, "trajectories", stopping)
+    with pytest.raises(KeyboardInterrupt):
+        export_dataset(tiny, name, tmp_path / "out", snapshots="last")
+    assert not (tmp_path / "out").exists()
+    seen: list[tuple[int, int]] = []
+    files = export_dataset(
+        tiny, name, tmp_path / "out", snapshots="last", progress=lambda *counts: seen.append(counts)
+    ).files
+    assert read == [0, 3, 40, 40, 60, 99]
+    assert seen == [(done, 5) for done in range(1, 6)]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "straight"]
+    relative = [file.relative_to(tmp_path / "out") for file in files]
+    assert relative == [file.relative_to(tmp_path / "straight") for file in straight]
+    for file, other in zip(files, straight, strict=True):
+        assert file.read_bytes() == other.read_bytes() or name == "minari"  # whose records name the time
+
+
+def interrupted(tiny: Dataset, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    original = Dataset.trajectories
+
+    def stopping(self: Dataset, task: int, step: int, run: str = "main") -> list[Trajectory]:
+        if task == 40:
+            raise KeyboardInterrupt
+        return original(self, task, step, run)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Dataset, "trajectories", stopping)
+        with pytest.raises(KeyboardInterrupt):
+            export_dataset(tiny, "hdf5", out, snapshots="last")
+
+
+def test_another_export_to_the_same_place_begins_anew(
+    tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(tiny, tmp_path / "out", monkeypatch)
+    files = export_dataset(tiny, "hdf5", tmp_path / "out", snapshots="steps>=100", tasks=[3]).files
+    assert [file.name for file in files] == ["task_00003.hdf5"]
+    with h5py.File(files[0]) as file:
+        assert file.attrs["snapshots"].tolist() == [100, 150]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+
+def test_two_exports_to_one_place_exclude_each_other(
+    tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    interrupted(tiny, tmp_path / "out", monkeypatch)
+    staged = staging_folder(tmp_path / "out")
+    before = sorted(staged.rglob("*"))
+    with (
+        lock_file(staged / LOCK, "the export"),
+        pytest.raises(LockedError, match=r"the export .*out is being written by process"),
+    ):
+        export_dataset(tiny, "hdf5", tmp_path / "out", snapshots="last")
+    assert sorted(staged.rglob("*")) == before
+
+
+@pytest.mark.parametrize("is_link", [False, True])
+def test_what_lies_where_exports_are_staged_is_left_alone(
+    is_link: bool, tiny: Dataset, tmp_path: Path
+) -> None:
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "notes").touch()
+    staged = staging_folder(tmp_path / "out")
+    if is_link:
+        staged.symlink_to(mine)
+    else:
+        shutil.copytree(mine, staged)
+    with pytest.raises(
+        StoreError, match=r"\.out\.partial is in the way, where exports are staged; remove it"
+    ):
+        export_dataset(tiny, "hdf5", tmp_path / "out")
+    assert (staged / "notes").exists() and not (tmp_path / "out").exists()
+
+
+def test_a_dry_run_checks_everything_and_writes_nothing(tiny: Dataset, tmp_path: Path) -> None:
+    report = export_dataset(tiny.folder, "robomimic", tmp_path / "out", split="test", dry_run=True)
+    assert (report.tasks, report.parts, report.episodes, report.steps) == (1, 3, 18, 360)
+    assert (report.files, list(tmp_path.iterdir())) == ((), [])
+    (tmp_path / "file").touch()
+    with pytest.raises(StoreError, match="not empty"):
+        export_dataset(tiny, "hdf5", tmp_path, dry_run=True)
+
+
+@pytest.mark.parametrize(
+    ("selection", "error", "expected"),
+    [
+        ({"tier": "best"}, SelectionError, "best"),
+        ({"tier": "expert", "snapshots": "last"}, SelectionError, "exclude each other"),
+        ({"tasks": [1]}, TaskError, "no task 1"),
+        ({"tasks": [0], "split": "test"}, SelectionError, "no test tasks"),
+    ],
+)
+def test_a_selection_that_cannot_be_met_is_refused(
+    selection: dict[str, Any], error: type[Exception], expected: str, tiny: Dataset, tmp_path: Path
+) -> None:
+    with pytest.raises(error, match=expected):
+        export_dataset(tiny, "hdf5", tmp_path / "out", **selection)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", [name for name in READERS if name != "hdf5"])
+def test_an_episode_without_steps_is_refused(
+    name: str, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    none = np.zeros(0, dtype=bool)
+    empty = Trajectory(np.zeros((1, 2)), np.zeros((0, 2)), np.zeros(0), none, none)
+    monkeypatch.setattr(Dataset, "trajectories", lambda self, *key: [empty])
+    with pytest.raises(StoreError, match=r"0000150.zip: episode 0 has no steps.*hdf5"):
+        exported(tiny, name, tmp_path / "out", snapshots="last")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "expected"),
+    [
+        (lambda columns: columns.pop("episode"), "no column episode"),
+        (lambda columns: columns.update(episode=np.zeros(4)), "episode and step are no integers"),
+        (lambda columns: columns.update(reward=np.full(4, np.nan, np.float32)), "not finite"),
+        (lambda columns: columns.update(terminated=np.ones(4, bool)), "before the episode's last step"),
+        (lambda columns: columns.update(observation=list(np.zeros((4, 2)))), "does not begin"),
+        (lambda columns: columns.update(action=np.zeros(4)), "column action has no lists"),
+        (lambda columns: columns.update(action=[[0.0], [0.0, 1.0], [0.0, 1.0], [0.0]]), "action has"),
+        (lambda columns: columns.update(reward=["much"] * 4), "no column reward of numbers"),
+        (lambda columns: columns.update(reward=[None, 1.0, 2.0, 3.0]), "reward lacks values"),
+    ],
+)
+def test_a_table_that_is_no_row_a_transition_is_refused(
+    change: Callable[[dict[str, Any]], object], expected: str, tmp_path: Path
+) -> None:
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    columns = table()
+    change(columns)
+    parquet.write_table(pyarrow.table(columns), tmp_path / "t.parquet")
+    with pytest.raises(StoreError, match=expected) as refused:
+        import_dataset("parquet", [tmp_path / "t.parquet"], tmp_path / "out")
+    assert str(tmp_path / "t.parquet") in str(refused.value)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("codec", ["none", "snappy", "gzip", "zstd"])
+def test_a_table_of_another_program_is_read(codec: str, tmp_path: Path) -> None:
+    """Doubles and lists without a fixed length, no step and no task."""
+    pyarrow = pytest.importorskip("pyarrow")
+    parquet = pytest.importorskip("pyarrow.parquet")
+    parquet.write_table(pyarrow.table(table()), tmp_path / "t.parquet", compression=codec)
+    report = import_dataset("parquet", [tmp_path / "t.parquet"], tmp_path / "out", task=7)
+    first, second = open_dataset(tmp_path / "out").trajectories(7, 0)
+    assert (len(first), len(second), report.notes) == (3, 1, ())
+    np.testing.assert_array_equal(first.observations, [[0, 0], [1, 1], [2, 2], [3, 3]])
+    assert (first.terminated[-1], second.truncated[-1]) == (True, True)
+    assert list(first.extras) == ["effort"]
+    assert EPISODE_ARRAYS[0] == "observations"
+
+
+def table() -> dict[str, Any]:
+    """Two episodes, of three steps and of one."""
+    before = np.array([[0, 0], [1, 1], [2, 2], [5, 5]], dtype=np.float64)
+    return {
+        "episode": np.array([4, 4, 4, 2]),
+        "observation": list(before),
+        "action": list(np.full((4, 1), 0.5)),
+        "reward": np.arange(4, dtype=np.float64),
+        "next_observation": list(before + 1),
+        "terminated": np.array([False, False, True, False]),
+        "truncated": np.array([False, False, False, True]),
+        "effort": np.arange(4),
+        "note": ["a"] * 4,
+    }
