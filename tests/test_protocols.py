@@ -9,9 +9,10 @@ from torch import Tensor
 
 from tcmrl_algo import PROTOCOLS, Capabilities
 from tcmrl_algo.adaptation.evaluate import contexts_of_others
+from tcmrl_algo.adaptation.protocols.non_prior import num_uniform_steps
 from tcmrl_algo.methods.privileged import TaskParameters
 from tcmrl_data import Controller, Dataset, TrainingError, Trajectory
-from tests.adapters import GoalController, GoalReader, GoalSeeker, arena, oracle
+from tests.adapters import GOALS, GoalController, GoalReader, GoalSeeker, arena, oracle
 
 STATEFUL = Capabilities(stateful=True, needs_trajectories=False)
 
@@ -237,3 +238,31 @@ def test_a_privileged_method_is_given_the_parameters_of_every_lane(
         expected[:2].tolist(), expected[2:].tolist()
     ]  # fmt: skip
     assert not (expected[0] == expected[1]).all()
+
+
+def test_non_prior_acts_uniformly_for_half_of_all_steps() -> None:
+    steps = [num_uniform_steps(episode, episodes=3, horizon=200) for episode in range(3)]
+    assert steps == [200, 100, 0]  # steps 0 to 299 of 600
+    assert [num_uniform_steps(episode, episodes=4, horizon=20) for episode in range(4)] == [20, 20, 0, 0]
+    assert num_uniform_steps(0, episodes=1, horizon=20) == 20
+
+
+def test_non_prior_knows_the_episodes_before_and_ignores_the_methods_own_exploration(
+    two_tests: Dataset,
+) -> None:
+    class Stubborn(GoalReader):
+        def explore(self, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
+            raise AssertionError("no method collects in its own way")
+
+    algorithm = Stubborn()
+    place = arena(two_tests, algorithm, episodes=3, random_episodes=2)
+    adaptations = PROTOCOLS.get("non_prior")().adapt(place, two_tests.test_tasks)
+    assert algorithm.seen == [[1, 1], [2, 2]]  # the third context: the first two blocks alone
+    for task, adaptation in zip(two_tests.test_tasks, adaptations, strict=True):
+        ((first, second, third),) = adaptation.contexts
+        goal = GOALS[task.index]
+        expected = np.clip((goal - second.observations[:-1]) / 0.1, -1.0, 1.0)
+        by_policy = np.isclose(second.actions, expected, atol=1e-5).all(axis=1)
+        assert by_policy[10:].all() and not by_policy[:10].any()
+        assert not np.isclose(first.actions, expected, atol=1e-5).all(axis=1).any()
+        assert third.undiscounted_return == pytest.approx(oracle(two_tests, task), abs=0.05)

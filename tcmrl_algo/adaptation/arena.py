@@ -17,6 +17,7 @@ from tcmrl_data import (
     Task,
     TrainingError,
     Trajectory,
+    UniformController,
     keyed_generator,
 )
 
@@ -79,9 +80,20 @@ class Arena:
         self._stage, self._done, self._total = stage, 0, total
 
     def adapted(
-        self, tasks: Sequence[Task], contexts: Sequence[Context], *, episode: int
+        self,
+        tasks: Sequence[Task],
+        contexts: Sequence[Context],
+        *,
+        episode: int,
+        around: Callable[[Controller], Controller] | None = None,
     ) -> list[Trajectory]:
         """One episode per lane, by the policy adapted to the lane's context; lanes may repeat tasks.
+
+        Args:
+            tasks: of the lanes.
+            contexts: of the lanes.
+            episode: number of the episode, part of its seeds.
+            around: makes the controller that acts from the adapted one.
 
         Raises:
             TrainingError: an empty context, for a method that needs trajectories.
@@ -89,9 +101,14 @@ class Arena:
         self._check_contexts(tasks, contexts)
 
         def control(lanes: slice) -> Controller:
-            return self._adapt(tasks[lanes], contexts[lanes])
+            adapted = self._adapt(tasks[lanes], contexts[lanes])
+            return adapted if around is None else around(adapted)
 
         return self._lanes.run(tasks, control, episode=episode, done=self._count)
+
+    def uniform(self, tasks: Sequence[Task], *, episode: int) -> list[Trajectory]:
+        """One episode per lane by uniform actions, whatever the method's exploration is."""
+        return self._lanes.run(tasks, lambda lanes: UniformController(), episode=episode, done=self._count)
 
     def explored(
         self, tasks: Sequence[Task], collected: Sequence[Context], *, episode: int

@@ -10,7 +10,8 @@ encoder through z_t alone. The actor-critic, ours as for FOCAL, sees detached co
 
 Deviations: the published meta-batch holds every task once, so that L_distance there only repels; `positives`
 chooses between that and the equation. The published code squashes the variance of q together with its mean,
-where only the mean was meant: see `variance`.
+by oversight, yet lambda was chosen with it: if the variance is free to fall, L_club grows without bound as q
+learns, and lambda 25 made all contexts equal on the point robot within 400 steps. See `variance`.
 """
 
 import math
@@ -56,7 +57,8 @@ class CsroConfig(MethodConfig):
         epsilon: bounds the repulsion of two tasks' contexts (published code: 0.1).
         positives: `trajectories` also draws the contexts of a task's trajectories together, as the equation
             does; `none` only repels the contexts of tasks, as the published code does.
-        variance: `softplus` leaves the variance of q free; `literal` squashes it to [0.31, 1.31].
+        variance: `literal` squashes the variance of q to [0.31, 1.31] (published code); `softplus` leaves it
+            free, and needs a much smaller `penalty`.
         random_share: share of `run.random_episodes` that act uniformly; in the others the policy acts under
             the context of those before (published code: half of the exploration). 1 collects as other
             methods do.
@@ -70,7 +72,7 @@ class CsroConfig(MethodConfig):
     distance_weight: float = Field(default=10.0, ge=0)
     epsilon: float = Field(default=0.1, gt=0)
     positives: Literal["none", "trajectories"] = "trajectories"
-    variance: Literal["softplus", "literal"] = "softplus"
+    variance: Literal["softplus", "literal"] = "literal"
     random_share: float = Field(default=0.5, gt=0, le=1)
 
 
