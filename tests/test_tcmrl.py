@@ -296,6 +296,24 @@ def test_a_switch_changes_its_own_terms_and_nothing_else(change: dict[str, Any],
     torch.testing.assert_close(first.context, second.context)
 
 
+@pytest.mark.parametrize("level", ["transition", "trajectory"])
+def test_more_execution_trajectories_are_more_targets_and_change_no_other_loss(level: str) -> None:
+    many = steps(TASKS, 3, EPISODE, seed=4)
+
+    def metrics(config: dict[str, Any], chosen: slice) -> dict[str, Tensor]:
+        fields = {name: None if value is None else value[:, chosen] for name, value in vars(many).items()}
+        made = learner({"reward_estimation": level, "negative_noise": 0.0} | config)
+        return losses_of(made, with_steps(batch(), execution=Steps(**fields))).metrics
+
+    first, second = metrics({}, slice(1)), metrics({}, slice(3))
+    different = {name for name, value in first.items() if not torch.equal(value, second[name])}
+    assert different == {"loss/positive", "loss/negative"}
+    singles = [metrics({}, slice(place, place + 1))["loss/positive"] for place in range(3)]
+    torch.testing.assert_close(second["loss/positive"], torch.stack(singles).mean())
+    more = metrics({"distance_examples": 3}, slice(3))
+    assert not torch.equal(more["loss/distance"], second["loss/distance"])
+
+
 @pytest.mark.parametrize("window_length", [2, 3, 4])
 def test_k_is_the_length_of_the_windows(window_length: int) -> None:
     made = settings()

@@ -83,6 +83,8 @@ class TcmrlConfig(MethodConfig):
         negative_noise: standard deviation of `random`, in standard deviations of the reward
             (published code: 0.5, of the raw reward).
         temperature: of the contrastive loss (paper: none, 1).
+        distance_examples: execution trajectories that the distance-metric loss takes as further examples of
+            their task (ours), so that more of them for Eq. 17 change no other loss.
         weights: of the loss terms.
     """
 
@@ -98,6 +100,7 @@ class TcmrlConfig(MethodConfig):
     negative_reward: losses.NegativeKind = "random"
     negative_noise: float = Field(default=0.5, ge=0)
     temperature: float = Field(default=1.0, gt=0)
+    distance_examples: int = Field(default=1, ge=1)
     weights: Weights = Weights()
 
 
@@ -135,14 +138,15 @@ class TcmrlLearner(ContextLearner):
         """The weighted terms; those of weight 0 are not computed.
 
         Contexts come from the context trajectories alone; the execution trajectories are what rewards
-        are estimated on, and further examples of every task for the distance-metric loss. Without drawn
-        windows, the contrastive loss takes all windows of the context trajectories.
+        are estimated on, and the first of them further examples of every task for the distance-metric loss.
+        Without drawn windows, the contrastive loss takes all windows of the context trajectories.
         """
         weights, encoder = self.config.weights, self.encoder
         context, execution = encoder.read(batch["context"]), encoder.read(batch["execution"])
         windows = encoder.read(batch["windows"]) if "windows" in batch else context
+        examples = execution.first(self.config.distance_examples)
         groups = [context]
-        groups += [execution] if weights.distance else []
+        groups += [examples] if weights.distance else []
         groups += [windows] if weights.contrastive and windows is not context else []
         representations = encoder(*groups)
         attention = self._attend(representations[0].flatten(1, 2), context.mask.flatten(1, 2))
@@ -152,7 +156,7 @@ class TcmrlLearner(ContextLearner):
             last = representations[-1] if windows is not context else representations[0]
             terms["contrastive"] = self._contrastive_loss(last, windows.mask)
         if weights.distance:
-            mask = torch.cat([context.mask, execution.mask], dim=1)
+            mask = torch.cat([context.mask, examples.mask], dim=1)
             terms["distance"] = self._distance_loss(torch.cat(representations[:2], dim=1), mask)
         total = attention.context.new_zeros(())
         for name, term in terms.items():

@@ -36,6 +36,10 @@ class EncoderInputs:
         """r_t and s_{t+1} - s_t."""
         return self.inputs[..., self.state_action :]
 
+    def first(self, number: int) -> "EncoderInputs":
+        """The first trajectories of every task."""
+        return EncoderInputs(self.inputs[:, :number], self.mask[:, :number], self.state_action)
+
     @property
     def rewards(self) -> Float[Tensor, "tasks trajectories steps"]:
         """r_t."""
