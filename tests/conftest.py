@@ -19,7 +19,8 @@ from tcmrl_data import Dataset, Recipe
 from tests.namespace import has_only_loopback
 from tests.workers import MARK, ROOT
 
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported; its threads wait busily
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read when torch is imported
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # more threads than one wait without spinning
 sys.path.append(str(Path(__file__).parent / "doubles"))  # a distribution: methods as plug-ins
 sys.path.append(str(ROOT))  # for `benchmarks`, which makes datasets of many parts
 

@@ -297,7 +297,8 @@ def test_a_failed_run_is_told_and_tried_again(tiny_folder: Path, tmp_path: Path,
 def test_what_never_began_takes_a_new_device_and_new_threads(
     tiny_folder: Path, tmp_path: Path, call: Call
 ) -> None:
-    file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
+    content = experiments.tables(tiny_folder, protocols=["offline"], curve_points=1, claims=[])
+    file = experiments.write_file(tmp_path / "small.toml", content)
     arguments = ["experiment", file, "--out", tmp_path / "out", "--only", "TCMRL", "--seeds", "0"]
     assert_refused(call(*arguments, "--device", "cudda"), "--device 'cudda'")
     assert not (tmp_path / "out").exists()
@@ -311,7 +312,9 @@ def test_what_never_began_takes_a_new_device_and_new_threads(
         job.parent.with_name(f"{job.parent.name}.json").unlink()
 
 
-@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL])
+@pytest.mark.parametrize(
+    "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.sweep)], ids=str
+)
 def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
     end: signal.Signals, tiny_folder: Path, tmp_path: Path
 ) -> None:
