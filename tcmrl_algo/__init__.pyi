@@ -10,6 +10,7 @@ from .adaptation.results import TaskResult as TaskResult
 from .context_methods.learner import ContextAlgorithm as ContextAlgorithm
 from .context_methods.learner import ContextLearner as ContextLearner
 from .context_methods.learner import ContextLosses as ContextLosses
+from .context_methods.requests import policy_transitions as policy_transitions
 from .experiment.aggregate import Summary as Summary
 from .experiment.aggregate import summarize as summarize
 from .experiment.config import Experiment as Experiment

@@ -8,6 +8,7 @@ import numpy as np
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, Trajectory, open_dataset
+from tcmrl_data.envs.base import DENSE_REWARDS
 from tcmrl_data.envs.tasks import draw_tasks
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
@@ -39,6 +40,7 @@ def graded_dataset(
     recipe: Recipe | None = None,
     episodes: Mapping[int, int] | None = None,
     moved: bool = False,
+    dense: bool = False,
 ) -> Dataset:
     """Writes a dataset whose parts have given scores; episode e returns its part's mean + e - 1.5.
 
@@ -51,6 +53,7 @@ def graded_dataset(
         recipe: what it was built from.
         episodes: step to number of episodes, where it is not 4.
         moved: the tasks' goals are others than the recipe draws.
+        dense: parts hold dense rewards too, -1, -2, … in the steps of every episode.
     """
     recipe = recipe or graded_recipe()
     drawn = draw_tasks(recipe.make_environment())
@@ -68,7 +71,8 @@ def graded_dataset(
                 seed=seed,
                 snapshot=None,
                 trajectories=[
-                    _episode(score / 10 + e - (number - 1) / 2, (seed, task, step, e)) for e in range(number)
+                    _episode(score / 10 + e - (number - 1) / 2, (seed, task, step, e), dense=dense)
+                    for e in range(number)
                 ],
                 references=references,
             )
@@ -89,13 +93,15 @@ def graded_dataset(
     return open_dataset(folder)
 
 
-def _episode(total: float, key: tuple[int, ...]) -> Trajectory:
+def _episode(total: float, key: tuple[int, ...], *, dense: bool) -> Trajectory:
     generator = np.random.default_rng(key)
     ended = np.arange(HORIZON) == HORIZON - 1
+    extras = {DENSE_REWARDS: -np.arange(1, HORIZON + 1, dtype=np.float32)} if dense else {}
     return Trajectory(
         generator.normal(size=(HORIZON + 1, 2)).astype(np.float32),
         generator.uniform(-1, 1, (HORIZON, 2)).astype(np.float32),
         np.full(HORIZON, total / HORIZON, dtype=np.float32),
         np.zeros(HORIZON, dtype=bool),
         ended,
+        extras,
     )

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from tcmrl_data import BatchRequest, Trajectory
+from tcmrl_data.envs.base import DENSE_REWARDS
 from tcmrl_data.sampling.rows import Episodes, PackedRows, fill_rows
 from tcmrl_data.sampling.sampler import Sampler
 from tcmrl_data.store.arrays import pack
@@ -15,7 +16,8 @@ def rows_of(tasks: Sequence[Sequence[Trajectory]]) -> PackedRows:
     first = tasks[0][0]
     observation_dim, action_dim = first.observations.shape[1], first.actions.shape[1]
     counts = [sum(len(episode) + 1 for episode in task) for task in tasks]
-    table = np.zeros((sum(counts) + max(counts), observation_dim + action_dim + 2), dtype=np.float32)
+    width = observation_dim + action_dim + 2 + (DENSE_REWARDS in first.extras)
+    table = np.zeros((sum(counts) + max(counts), width), dtype=np.float32)
     lengths, start = [], 0
     for task, count in zip(tasks, counts, strict=True):
         lengths.append(fill_rows(table[start : start + count], pack(task)))

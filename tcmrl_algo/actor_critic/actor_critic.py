@@ -17,7 +17,7 @@ from tcmrl_algo.networks.optimizer import Adam
 from tcmrl_algo.networks.perceptron import Perceptron, PerceptronEnsemble, Standardizer, call_frozen
 from tcmrl_algo.networks.policy import PolicyActions, PolicyNetwork
 from tcmrl_algo.settings.actor_critic import ActorCriticSettings
-from tcmrl_data import Controller, Steps
+from tcmrl_data import Controller, Steps, TrainingError
 
 LARGEST_Q = "actor_critic/largest_q"
 
@@ -25,10 +25,20 @@ LARGEST_Q = "actor_critic/largest_q"
 def value_bounds(settings: ActorCriticSettings, problem: Problem) -> tuple[float, float]:
     """Lowest and highest V that rewards within the data's range can add up to.
 
+    The rewards are those that the actor-critic learns from, stored or dense ones.
     An episode may end after one step, or go on forever: time limits do not cut the sum. The highest V
     includes the largest entropy bonus; the lowest leaves out what a narrow policy's entropy takes away.
+
+    Raises:
+        TrainingError: dense rewards, of which the batches hold none.
     """
-    lowest, highest = (settings.reward_scale * reward for reward in problem.reward_range)
+    rewards = problem.reward_range if settings.rewards == "stored" else problem.dense_reward_range
+    if rewards is None:
+        raise TrainingError(
+            "actor_critic.rewards is 'dense', but the method's batches hold stored rewards only; "
+            "let its batch_request take policy_transitions(settings)"
+        )
+    lowest, highest = (settings.reward_scale * reward for reward in rewards)
     most_steps = 1.0 / (1.0 - settings.gamma)
     bonus = settings.entropy * problem.action_dim * 0.6931471805599453  # ln 2: uniform in [-1, 1]
     return min(lowest, lowest * most_steps), max(highest + bonus, (highest + bonus) * most_steps)

@@ -13,10 +13,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.context_methods.requests import policy_transitions
 from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, BatchRequest, Steps, Transitions
+from tcmrl_data import Batch, BatchRequest, Steps
 
 
 @final
@@ -42,7 +43,7 @@ class NoContext(Method[MethodConfig]):
 
     def batch_request(self, settings: TrainingSettings, config: MethodConfig) -> BatchRequest:
         """The actor-critic's transitions: nothing here reads a trajectory."""
-        return BatchRequest(settings.batch.tasks, {"policy": Transitions(settings.batch.transitions)})
+        return BatchRequest(settings.batch.tasks, {"policy": policy_transitions(settings)})
 
     def create(self, problem: Problem, settings: TrainingSettings, config: MethodConfig) -> Algorithm:
         return ContextAlgorithm(problem, settings, learner=Blind())

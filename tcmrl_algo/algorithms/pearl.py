@@ -23,12 +23,13 @@ from torch.nn import functional
 from tcmrl_algo.actor_critic.actor_critic import ActorCritic
 from tcmrl_algo.context_methods.encoding import ContextEncoder
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.context_methods.requests import policy_transitions
 from tcmrl_algo.losses.gaussians import gaussian_divergence, product_of_gaussians
 from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectories, Trajectory, Transitions
+from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectories, Trajectory
 
 POSTERIOR_STREAM, PRIOR_STREAM = 2, 3
 """Of the draws at test, apart from those of training."""
@@ -122,7 +123,7 @@ class Pearl(Method[PearlConfig]):
         return BatchRequest(
             batch.tasks,
             {
-                "policy": Transitions(batch.transitions),
+                "policy": policy_transitions(settings),
                 "context": Trajectories(batch.context_trajectories),
             },
         )

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from tcmrl_algo.context_methods.encoding import ContextEncoder, EncoderInputs
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.context_methods.requests import policy_transitions
 from tcmrl_algo.losses import context as losses
 from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig, Metrics
 from tcmrl_algo.methods.problem import Problem
@@ -17,7 +18,7 @@ from tcmrl_algo.networks.attention import Attention, TaskExtractor, uniform_atte
 from tcmrl_algo.networks.perceptron import call_frozen
 from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions, Windows
+from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Windows
 
 SPARSITY = {
     "sigmoid": losses.sparsity_loss,
@@ -265,7 +266,7 @@ class Tcmrl(Method[TcmrlConfig]):
         return BatchRequest(
             batch.tasks,
             {
-                "policy": Transitions(batch.transitions),
+                "policy": policy_transitions(settings),
                 "context": Trajectories(batch.context_trajectories),
                 "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
                 "windows": Windows(batch.windows, batch.window_length),

@@ -27,6 +27,7 @@ class Problem:
         action_mean, action_std: (action_dim,).
         reward_mean, reward_std: of single steps.
         reward_range: lowest and highest reward of a step.
+        dense_reward_range: those of dense rewards, if the actor-critic learns from them; else None.
         seed: the run's.
         stages: of training; schedules stretch over them.
         training_tasks: indices of the training tasks, ascending.
@@ -54,6 +55,7 @@ class Problem:
     training_tasks: tuple[int, ...]
     privileged: Float[Tensor, "training_tasks parameters"] | None
     device: torch.device
+    dense_reward_range: tuple[float, float] | None = None
 
     def position(self, task_indices: Int64[Tensor, " tasks"]) -> Int64[Tensor, " tasks"]:
         """Dense indices, from 0, of training tasks given by the indices that batches hold."""
@@ -84,6 +86,7 @@ class MomentsRecord(BaseModel):
     reward_std: float
     reward_min: float
     reward_max: float
+    dense_reward_range: tuple[float, float] | None = None
 
     @classmethod
     def of(cls, moments: Moments) -> "MomentsRecord":
@@ -128,4 +131,5 @@ def problem_of(
         training_tasks=tuple(sorted(training_tasks)),
         privileged=None if privileged is None else privileged.to(device),
         device=device,
+        dense_reward_range=moments.dense_reward_range,
     )

@@ -1,5 +1,7 @@
 """The `[training.actor_critic]` table."""
 
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 from tcmrl_algo.settings.brac import BracSettings
@@ -11,6 +13,10 @@ class ActorCriticSettings(BaseModel):
     Attributes:
         hidden: widths of all networks here (published code: 256 x 3).
         gamma: discount factor (paper, F.2: 0.99; published code: 0.9 for the point robots).
+        rewards: that the actor-critic learns from. `dense` takes the shaped rewards that a dataset stores
+            beside sparse ones, while contexts and evaluation keep the sparse ones (published code of IDAQ and
+            TCMRL on sparse-point-robot; paper: not said). Deviation from that code: TCMRL's reward estimator
+            learns from the stored rewards with either.
         reward_scale: multiplies rewards (published code: 5; 100 for the point robots).
         entropy: alpha in front of log pi (published code: 1, beside rewards scaled by 5 or 100).
         tau: step of V's target towards V (published code: 0.005).
@@ -28,6 +34,7 @@ class ActorCriticSettings(BaseModel):
 
     hidden: tuple[int, ...] = (256, 256, 256)
     gamma: float = Field(default=0.99, ge=0, lt=1)
+    rewards: Literal["stored", "dense"] = "stored"
     reward_scale: float = Field(default=5.0, gt=0)
     entropy: float = Field(default=1.0, ge=0)
     tau: float = Field(default=0.005, gt=0, le=1)

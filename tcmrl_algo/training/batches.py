@@ -68,8 +68,10 @@ def open_batches(
             selection, request, seed=seed, device=str(device), memory_limit=memory_limit, say=say
         )
 
-    requests = [stage.request for stage in stages]
-    transitions, contexts = split_request(requests[0])
+    requests = sorted((stage.request for stage in stages), key=lambda request: not request.takes_dense)
+    transitions, contexts = split_request(
+        requests[0]
+    )  # of a stage with dense rewards, so that they are loaded
     reads_contexts = any(split_request(request)[1].kinds for request in requests)
     if run.context_snapshots is None or not reads_contexts:
         return StagedBatches(sampler(run.snapshots, requests[0]), stages)

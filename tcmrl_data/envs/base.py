@@ -24,6 +24,9 @@ Parameters = Mapping[str, Any]
 Reward = Literal["stored", "dense"]
 """`stored`: the reward in the dataset. `dense`: the shaped reward, if the stored reward is sparse."""
 
+DENSE_REWARDS = "dense_rewards"
+"""The extra array that holds shaped rewards beside sparse ones, float32."""
+
 TaskSplit = Literal["permutation", "strata"]
 """How test tasks are drawn; `EnvironmentSettings` explains both."""
 

@@ -10,9 +10,18 @@ from typing import Any, Literal, final
 
 import gymnasium
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field
 
-from tcmrl_data.envs.base import Environment, EnvironmentSettings, Lanes, LaneStep, Parameters, Reward
+from tcmrl_data.envs.base import (
+    DENSE_REWARDS,
+    Environment,
+    EnvironmentSettings,
+    Lanes,
+    LaneStep,
+    Parameters,
+    Reward,
+)
 from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 
@@ -34,6 +43,17 @@ class PointRobotSettings(EnvironmentSettings):
     wind_limit: float = Field(default=0.05, ge=0)
 
 
+class SparsePointRobotSettings(PointRobotSettings):
+    """Settings of the point robot with sparse rewards.
+
+    Attributes:
+        dense_rewards: parts also store -dist of every step, as the array `dense_rewards`. The published code
+            of IDAQ and TCMRL trains the actor-critic on them; sparse ones go to the context alone.
+    """
+
+    dense_rewards: bool = False
+
+
 class _PointRobot(Environment):
     """Base class of the point robots: planar motion, stepped as one NumPy batch."""
 
@@ -45,6 +65,10 @@ class _PointRobot(Environment):
     def rewards(self, distances: FloatArray, reward: Reward) -> FloatArray:
         """Rewards (...) for distances (...) to the goal after the step."""
         return -distances
+
+    def extra_arrays(self, distances: FloatArray) -> dict[str, npt.NDArray[np.generic]]:
+        """The extra arrays of a step that ends at distances (lanes,) to the goal."""
+        return {}
 
     def make(
         self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
@@ -77,7 +101,15 @@ class SparsePointRobot(_PointRobot):
     """Goals evenly spaced on the half circle; a reward only near the goal."""
 
     name = "sparse-point-robot"
+    Settings = SparsePointRobotSettings
+    settings: SparsePointRobotSettings
     ordering_name = "goal angle (rad)"
+
+    def __init__(self, settings: EnvironmentSettings) -> None:
+        super().__init__(settings)
+        if self.settings.dense_rewards:
+            # of the class elsewhere; here the recipe says whether they are stored
+            self.extras = {DENSE_REWARDS: np.float32}  # type: ignore[misc]
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         return half_circle_goals(num_tasks)
@@ -91,6 +123,9 @@ class SparsePointRobot(_PointRobot):
         radius = self.settings.goal_radius
         scale = radius if self.settings.sparse_reward == "normalized" else 1.0
         return np.where(distances <= radius, 1.0 - distances / scale, 0.0)
+
+    def extra_arrays(self, distances: FloatArray) -> dict[str, npt.NDArray[np.generic]]:
+        return {name: (-distances).astype(kind) for name, kind in self.extras.items()}
 
 
 @final
@@ -165,7 +200,11 @@ class PointRobotLanes(Lanes):
         distances = np.linalg.norm(self._positions - self._goals, axis=-1)
         rewards = np.where(active, self._environment.rewards(distances, self._reward), 0.0)
         truncated = active & (self._steps >= self._environment.settings.horizon)
-        return LaneStep(self._positions.copy(), rewards, np.zeros_like(truncated), truncated, {})
+        extras = {
+            name: np.where(active, array, 0)
+            for name, array in self._environment.extra_arrays(distances).items()
+        }
+        return LaneStep(self._positions.copy(), rewards, np.zeros_like(truncated), truncated, extras)
 
     def close(self) -> None:
         pass
@@ -194,5 +233,5 @@ class PointRobotEnv(gymnasium.Env[FloatArray, FloatArray]):
             float(step.rewards[0]),
             bool(step.terminated[0]),
             bool(step.truncated[0]),
-            {},
+            {name: array[0] for name, array in step.extras.items()},
         )

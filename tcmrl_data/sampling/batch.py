@@ -19,7 +19,7 @@ class Steps:
     Attributes:
         observations: (..., observation_dim).
         actions: (..., action_dim) in [-1, 1].
-        rewards: (...).
+        rewards: (...); the dense ones if the kind was requested with `rewards="dense"`.
         next_observations: (..., observation_dim).
         terminated: (...) float, 1 if the task ended the episode, else 0; a time limit is 0.
         mask: (...) bool, False on padding.
@@ -92,6 +92,7 @@ class Moments:
         delta_mean, delta_std: (observation_dim,), for next observation minus observation.
         action_mean, action_std: (action_dim,).
         reward_mean, reward_std, reward_min, reward_max: statistics of the reward per step.
+        dense_reward_range: smallest and largest dense reward per step; None if dense rewards are not loaded.
         longest_episode: length of the longest episode in steps.
     """
 
@@ -106,3 +107,4 @@ class Moments:
     reward_min: float
     reward_max: float
     longest_episode: int
+    dense_reward_range: tuple[float, float] | None = None

@@ -52,6 +52,7 @@ def cache_folder() -> Path:
 def load_rows(
     selection: "Selection",
     *,
+    dense: bool = False,
     memory_limit: int | None = None,
     say: Callable[[str], None] = lambda message: None,
 ) -> PackedRows:
@@ -59,23 +60,27 @@ def load_rows(
 
     Args:
         selection: the selection.
+        dense: load dense rewards too.
         memory_limit: maximum size of the rows in memory, in bytes; None for half of the available memory.
         say: called with a message if the cache is used.
 
     Raises:
         CacheError: the rows fit neither into memory nor into the cache.
+        SelectionError: a part has no dense rewards.
         StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
     """
-    needed = _table_bytes(selection)
+    needed = _table_bytes(selection, dense)
     limit = available_memory() // 2 if memory_limit is None else memory_limit
     if needed <= limit:
-        return read_rows(selection)
+        return read_rows(selection, dense=dense)
     why = "half of the available memory" if memory_limit is None else "the memory limit"
     say(f"{size(needed)} of steps exceed {why}, {size(limit)}: using the cache")
-    return cached_rows(selection, say=say)
+    return cached_rows(selection, dense=dense, say=say)
 
 
-def cached_rows(selection: "Selection", *, say: Callable[[str], None] = lambda message: None) -> PackedRows:
+def cached_rows(
+    selection: "Selection", *, dense: bool = False, say: Callable[[str], None] = lambda message: None
+) -> PackedRows:
     """Opens the rows of a selection from the cache; decodes them into the cache if they are not there.
 
     If another process decodes them, this one waits; it decodes them itself if the other ends before.
@@ -83,14 +88,16 @@ def cached_rows(selection: "Selection", *, say: Callable[[str], None] = lambda m
 
     Args:
         selection: the selection.
+        dense: with dense rewards; they have an entry of their own.
         say: called with a message before decoding, and before waiting, starts.
 
     Raises:
         CacheError: the cache has no room, or its folder cannot be written.
+        SelectionError: a part has no dense rewards.
         StoreError: arrays cannot be decoded, do not form episodes, or are not those that the part's record
             names; the message names the part.
     """
-    folder, key = cache_folder(), entry_key(selection)
+    folder, key = cache_folder(), entry_key(selection, dense=dense)
     entry = entry_folder(folder, key)
     with _named_cache(folder):
         rows = open_entry(entry, selection)
@@ -100,8 +107,9 @@ def cached_rows(selection: "Selection", *, say: Callable[[str], None] = lambda m
             rows = open_entry(entry, selection)  # another process may have decoded it meanwhile
             if rows is None:
                 say(f"decoding {selection.dataset.folder} into {entry}; this happens once")
-                staged = reserve(folder, key, needed=entry_bytes(selection), limit=cache_limit())
-                rows = write_entry(staged, selection)
+                needed = entry_bytes(selection, dense=dense)
+                staged = reserve(folder, key, needed=needed, limit=cache_limit())
+                rows = write_entry(staged, selection, dense=dense)
                 publish(folder, key)
             return rows
 
@@ -182,6 +190,6 @@ def _named_cache(folder: Path) -> Iterator[None]:
         ) from None
 
 
-def _table_bytes(selection: "Selection") -> int:
-    rows, width = table_shape(selection, plan_rows(selection))
+def _table_bytes(selection: "Selection", dense: bool) -> int:
+    rows, width = table_shape(selection, plan_rows(selection, dense=dense))
     return 4 * rows * width

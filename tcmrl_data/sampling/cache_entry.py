@@ -28,11 +28,11 @@ from tcmrl_data.foundation.locks import take_shared_lock
 from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.sampling.cache_table import BLOCK, Blocks, TableSeal, table_problem, write_table
 from tcmrl_data.sampling.rows import (
-    ROW_ARRAYS,
     Episodes,
     PackedRows,
     Table,
     plan_rows,
+    row_arrays,
     selection_rows,
     table_shape,
 )
@@ -87,7 +87,7 @@ class EntryRecord(BaseModel):
     seal: TableSeal
 
 
-def entry_key(selection: "Selection") -> str:
+def entry_key(selection: "Selection", *, dense: bool = False) -> str:
     """The name of a selection's entry: a digest of what its rows hold, whatever the dataset claims.
 
     A part's id is the digest of its identity, which holds the sha256 of every decoded array. Decoding checks
@@ -100,13 +100,13 @@ def entry_key(selection: "Selection") -> str:
         for key in selection.parts[task.index]
     ]
     environment = dataset.environment
-    layout = (*ROW_ARRAYS, environment.observation_dim, environment.action_dim)
+    layout = (*row_arrays(dense), environment.observation_dim, environment.action_dim)
     return digest({"format": FORMAT, "layout": layout, "parts": parts})[:32]
 
 
-def entry_bytes(selection: "Selection") -> int:
+def entry_bytes(selection: "Selection", *, dense: bool = False) -> int:
     """The most that a selection's entry takes on disk, in bytes."""
-    plan = plan_rows(selection)
+    plan = plan_rows(selection, dense=dense)
     rows, width = table_shape(selection, plan)
     episodes = sum(part.episodes for part in plan)
     return (
@@ -182,21 +182,23 @@ def entry_problem(entry: Path, record: EntryRecord, *, limit: int | None = None)
     return table_problem(entry / ROWS, np.frombuffer(contents[BLOCKS], dtype=BLOCK))
 
 
-def write_entry(staged: Path, selection: "Selection") -> PackedRows:
+def write_entry(staged: Path, selection: "Selection", *, dense: bool = False) -> PackedRows:
     """Decodes a selection part by part into a staged folder that holds a file of zeros for the table.
 
     Args:
         staged: the folder; its name is the entry's key.
         selection: the selection.
+        dense: with dense rewards.
 
     Returns:
         The rows, with the entry locked; they stay valid when the folder is renamed.
 
     Raises:
+        SelectionError: a part has no dense rewards.
         StorageError: the operating system refuses a file operation.
         StoreError: arrays cannot be decoded, do not form episodes, or are not those of the part's record.
     """
-    plan = plan_rows(selection)
+    plan = plan_rows(selection, dense=dense)
     shape = table_shape(selection, plan)
     with named_errors(staged):
         lengths, blocks = write_table(staged / ROWS, plan, shape)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from tcmrl_data.envs.base import Reward
 from tcmrl_data.sampling.batch import Steps
 from tcmrl_data.sampling.rows import Episodes, Indices, PackedRows, Table
 
@@ -27,8 +28,9 @@ class Endings:
     discounts: Table
 
     @classmethod
-    def of(cls, rows: PackedRows, gamma: float) -> "Endings":
+    def of(cls, rows: PackedRows, gamma: float, rewards: Reward = "stored") -> "Endings":
         """Computes the endings for a discount factor, in double precision and chunks of whole episodes."""
+        column = rows.reward_column(rewards)
         episodes, returns = rows.episodes, np.zeros(len(rows.table), dtype=np.float32)
         ends = episodes.starts + episodes.lengths
         first = 0
@@ -38,7 +40,7 @@ class Endings:
             within = Episodes(
                 episodes.starts[first:last] - chunk.start, episodes.lengths[first:last], episodes.task_ranges
             )
-            returns[chunk] = _returns_to_go(rows.table[chunk, -2].astype(np.float64), within, gamma)
+            returns[chunk] = _returns_to_go(rows.table[chunk, column].astype(np.float64), within, gamma)
             first = last
         discounts = gamma ** np.arange(episodes.longest + 1, dtype=np.float64)
         return cls(rows, returns, discounts.astype(np.float32))

@@ -2,12 +2,15 @@
 
 import weakref
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from tcmrl_data.envs.base import Reward
 from tcmrl_data.sampling.batch import Batch, Steps
 from tcmrl_data.sampling.draws import Draw
 from tcmrl_data.sampling.endings import Endings
@@ -55,7 +58,7 @@ class Gatherer:
         request: the content of a batch.
         num_tasks: tasks per batch.
         device: device of the batches.
-        endings: endings of the rows; needed if a kind is requested with `returns=True`.
+        endings: endings of the rows by rewards; those of kinds that are requested with `returns=True`.
     """
 
     def __init__(
@@ -66,7 +69,7 @@ class Gatherer:
         *,
         num_tasks: int,
         device: torch.device,
-        endings: Endings | None = None,
+        endings: Mapping[Reward, Endings] = MappingProxyType({}),
     ) -> None:
         self._rows, self._device, self._num_tasks, self._endings = rows, device, num_tasks, endings
         self._width: int = rows.table.shape[1]
@@ -102,8 +105,9 @@ class Gatherer:
             layout = self._layout(name, rows[name].shape[1])
             found = layout if isinstance(layout, Steps) else _steps(memory, *layout)
             found = found if mask is None else replace(found, mask=mask)
-            if self._endings is not None and self._blocks[name].kind.returns:
-                found = self._endings.attach(found, rows[name])
+            kind = self._blocks[name].kind
+            if kind.returns:
+                found = self._endings[kind.rewards].attach(found, rows[name])
             steps[name] = found
         return Batch(torch.from_numpy(self._rows.task_indices[draw.tasks]), steps)
 
@@ -141,20 +145,20 @@ class Gatherer:
             if not isinstance(block.kind, Transitions):
                 length = self._longest if isinstance(block.kind, Trajectories) else block.kind.length
                 shape, strides = (*shape, length), (*strides, self._width)
-            self._layouts[name, number] = self._fields(shape, strides, block.offset)
+            self._layouts[name, number] = self._fields(shape, strides, block)
         return self._layouts[name, number]
 
-    def _fields(self, shape: tuple[int, ...], strides: tuple[int, ...], offset: int) -> _Fields | Steps:
-        """Views of the fields of steps with rows at an offset in a buffer, and a mask of ones."""
+    def _fields(self, shape: tuple[int, ...], strides: tuple[int, ...], block: _Block) -> _Fields | Steps:
+        """Views of the fields of a kind's steps in a buffer, and a mask of ones."""
         observation_dim, action_dim = self._rows.observation_dim, self._rows.action_dim
-        last = offset + self._width - 1
+        offset, reward = block.offset, self._rows.reward_column(block.kind.rewards)
         vectors, rows = (*shape, observation_dim), (*strides, 1)
         fields = [
             (vectors, rows, offset),
             ((*shape, action_dim), rows, offset + observation_dim),
-            (shape, strides, last - 1),
+            (shape, strides, offset + reward),
             (vectors, rows, offset + self._width),
-            (shape, strides, last),
+            (shape, strides, offset + self._rows.terminated_column),
         ]
         mask = torch.ones(shape, dtype=torch.bool, device=self._device)
         if 0 in shape:

@@ -16,16 +16,19 @@ def moments_of(rows: PackedRows) -> Moments:
     """Statistics of all transitions of the rows, computed in double precision."""
     table, episodes = rows.table, rows.episodes
     stop = int(episodes.starts[-1] + episodes.lengths[-1])
-    width, total = rows.observation_dim, _Sums(2 * rows.observation_dim + rows.action_dim + 1)
+    width, flags = rows.observation_dim, rows.terminated_column
+    total = _Sums(2 * rows.observation_dim + rows.action_dim + 1 + rows.has_dense)
     for first in range(0, stop, CHUNK_ROWS):
         last = min(first + CHUNK_ROWS, stop)
         kept = _is_step(episodes, first, last)
         values = table[first:last][kept].astype(np.float64)
         following = table[first + 1 : last + 1, :width][kept]
-        total.add(np.concatenate([following - values[:, :width], values[:, :-1]], axis=1))
+        columns = (following - values[:, :width], values[:, :flags], values[:, flags + 1 :])
+        total.add(np.concatenate(columns, axis=1))
     mean, std = total.mean, total.std
     delta, observation = slice(0, width), slice(width, 2 * width)
-    action, reward = slice(2 * width, -1), -1
+    action, reward = slice(2 * width, width + flags - 1), width + flags - 1
+    dense = (float(total.least[-1]), float(total.most[-1])) if rows.has_dense else None
     return Moments(
         observation_mean=mean[observation],
         observation_std=std[observation],
@@ -38,6 +41,7 @@ def moments_of(rows: PackedRows) -> Moments:
         reward_min=float(total.least[reward]),
         reward_max=float(total.most[reward]),
         longest_episode=episodes.longest,
+        dense_reward_range=dense,
     )
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, TypeAlias
 
+from tcmrl_data.envs.base import Reward
 from tcmrl_data.foundation.errors import RequestError
 
 
@@ -14,11 +15,14 @@ class Transitions:
     Attributes:
         number: transitions per task.
         returns: whether steps include returns to go, discounts, final observations and times.
+        rewards: `dense` takes the array `dense_rewards` as the steps' rewards, which environments with sparse
+            rewards may store beside them. The same transitions are drawn.
     """
 
     length: ClassVar[int] = 1
     number: int
     returns: bool = False
+    rewards: Reward = "stored"
 
 
 @dataclass(frozen=True, init=False)
@@ -36,6 +40,7 @@ class Trajectories:
         returns: as above.
     """
 
+    rewards: ClassVar[Reward] = "stored"
     numbers: tuple[int, ...]
     apart_from: str | None = None
     returns: bool = False
@@ -63,6 +68,7 @@ class Windows:
         returns: whether steps include returns to go, discounts, final observations and times.
     """
 
+    rewards: ClassVar[Reward] = "stored"
     number: int
     length: int
     returns: bool = False
@@ -113,6 +119,11 @@ class BatchRequest:
         _check_partners(self.kinds)
         kinds = {name: kind for name, kind in self.kinds.items() if kind.number}
         object.__setattr__(self, "kinds", kinds)
+
+    @property
+    def takes_dense(self) -> bool:
+        """Whether a kind takes dense rewards."""
+        return any(kind.rewards == "dense" for kind in self.kinds.values())
 
 
 def _check_numbers(name: str, kind: Kind) -> None:

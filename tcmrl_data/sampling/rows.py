@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.envs.base import DENSE_REWARDS, Reward
+from tcmrl_data.foundation.errors import SelectionError, StoreError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.store.arrays import Arrays, array_digests, checked_offsets
 from tcmrl_data.store.keys import PartKey
@@ -64,12 +65,13 @@ class Episodes:
 class PackedRows:
     """All steps of a selection; a row is (observation, action, reward, terminated).
 
-    An episode of T steps has T + 1 rows, so that the next observation is in the next row; the last row of an
-    episode holds an observation and zeros. After the last episode follow at least as many rows of zeros as
-    the longest episode has steps, so that a block of that length can start at any episode.
+    If dense rewards are loaded, they are a further column. An episode of T steps has T + 1 rows, so that the
+    next observation is in the next row; the last row of an episode holds an observation and zeros. After the
+    last episode follow at least as many rows of zeros as the longest episode has steps, so that a block of
+    that length can start at any episode.
 
     Attributes:
-        table: (rows, observation_dim + action_dim + 2).
+        table: (rows, observation_dim + action_dim + 2), or one column more with dense rewards.
         episodes: positions of the episodes in the table.
         observation_dim: width of observations.
         action_dim: width of actions.
@@ -81,6 +83,20 @@ class PackedRows:
     observation_dim: int
     action_dim: int
     task_indices: Indices
+
+    @property
+    def has_dense(self) -> bool:
+        """Whether dense rewards are loaded."""
+        return bool(self.table.shape[1] > self.terminated_column + 1)
+
+    @property
+    def terminated_column(self) -> int:
+        """Column of the flags."""
+        return self.observation_dim + self.action_dim + 1
+
+    def reward_column(self, rewards: Reward) -> int:
+        """Column of the stored or of the dense rewards."""
+        return self.terminated_column + (1 if rewards == "dense" else -1)
 
 
 @dataclass(frozen=True)
@@ -94,6 +110,7 @@ class PartRows:
         first: its first row.
         last: its last row + 1.
         episodes: number of its episodes.
+        dense: whether its dense rewards are read.
     """
 
     dataset: "Dataset"
@@ -102,16 +119,17 @@ class PartRows:
     first: int
     last: int
     episodes: int
+    dense: bool = False
 
 
-def plan_rows(selection: "Selection") -> list[PartRows]:
-    """Plans the rows of a selection's parts; opens no part."""
+def plan_rows(selection: "Selection", *, dense: bool = False) -> list[PartRows]:
+    """Plans the rows of a selection's parts, with dense rewards or without; opens no part."""
     plan, first = [], 0
     for position, task in enumerate(selection.tasks):
         for key in selection.parts[task.index]:
             entry = selection.dataset.entry(key)
             last = first + entry.steps + entry.episodes  # an episode has one row more than steps
-            plan.append(PartRows(selection.dataset, key, position, first, last, entry.episodes))
+            plan.append(PartRows(selection.dataset, key, position, first, last, entry.episodes, dense))
             first = last
     return plan
 
@@ -120,16 +138,18 @@ def table_shape(selection: "Selection", plan: Sequence[PartRows]) -> tuple[int, 
     """Shape of a selection's table; its padding is as long as the largest part, hence as any episode."""
     environment = selection.dataset.environment
     padding = max(part.last - part.first for part in plan)
-    return plan[-1].last + padding, environment.observation_dim + environment.action_dim + 2
+    width = environment.observation_dim + environment.action_dim + 2 + plan[0].dense
+    return plan[-1].last + padding, width
 
 
-def read_rows(selection: "Selection") -> PackedRows:
-    """Reads a selection into memory.
+def read_rows(selection: "Selection", *, dense: bool = False) -> PackedRows:
+    """Reads a selection into memory, with dense rewards or without.
 
     Raises:
+        SelectionError: a part has no dense rewards.
         StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
     """
-    plan = plan_rows(selection)
+    plan = plan_rows(selection, dense=dense)
     table: Table = np.zeros(table_shape(selection, plan), dtype=np.float32)
     lengths = list(map_parts(plan, lambda part: read_part(part, table[part.first : part.last])))
     return selection_rows(selection, table, Episodes.of(lengths, [part.task for part in plan]))
@@ -158,16 +178,33 @@ def read_part(part: PartRows, out: Table, *, check_digests: bool = False) -> Ind
             receive under the part's id.
 
     Raises:
+        SelectionError: the part has no dense rewards, and they are to be read.
         StoreError: arrays cannot be decoded, do not form episodes, or are not those of the part's record;
             the message names the part.
     """
-    arrays = part.dataset.arrays(*part.key, names=ROW_ARRAYS)
+    if part.dense:
+        _check_dense(part)
+    arrays = part.dataset.arrays(*part.key, names=row_arrays(part.dense))
     if check_digests:
         _check_digests(part, arrays)
     try:
         return fill_rows(out, arrays)
     except StoreError as error:
         raise StoreError(f"{part.dataset.file_of(part.key)}: {error}; run `tcmrl-data repair`") from None
+
+
+def row_arrays(dense: bool) -> tuple[str, ...]:
+    """The arrays that rows are made of."""
+    return (*ROW_ARRAYS, DENSE_REWARDS) if dense else ROW_ARRAYS
+
+
+def _check_dense(part: PartRows) -> None:
+    record = part.dataset.part(*part.key).identity.arrays.get(DENSE_REWARDS)
+    if record is None or record.dtype != "float32":
+        raise SelectionError(
+            f"{part.dataset.path}: the part of {part.key} has no dense rewards beside its rewards; take the "
+            'stored ones (rewards = "stored")'
+        )
 
 
 def _check_digests(part: PartRows, arrays: Arrays) -> None:
@@ -192,10 +229,12 @@ def fill_rows(out: Table, arrays: Arrays) -> Indices:
         StoreError: the arrays do not form episodes, or do not have the shape of `out`.
     """
     observations, actions = arrays["observations"], arrays["actions"]
-    if observations.shape[1] + actions.shape[1] + 2 != out.shape[1]:
+    dense = [name for name in arrays if name == DENSE_REWARDS]
+    columns = out.shape[1] - 2 - len(dense)
+    if observations.shape[1] + actions.shape[1] != columns:
         raise StoreError(
             f"observations and actions are {observations.shape[1]} and {actions.shape[1]} wide, the "
-            f"environment's take {out.shape[1] - 2} columns"
+            f"environment's take {columns} columns"
         )
     offsets = checked_offsets(arrays["episode_offsets"], len(actions))
     lengths = np.diff(offsets)
@@ -203,14 +242,15 @@ def fill_rows(out: Table, arrays: Arrays) -> Indices:
         raise StoreError(
             f"{len(observations)} observations do not fit {len(actions)} actions in {len(lengths)} episodes"
         )
-    for name in ("rewards", "terminated"):
+    scalars = ("rewards", "terminated", *dense)
+    for name in scalars:
         if len(arrays[name]) != len(actions):
             raise StoreError(f"{name} has {len(arrays[name])} steps, actions have {len(actions)}")
     observation_dim = observations.shape[1]
     # an episode has one row more than steps
     steps = np.arange(len(actions)) + np.repeat(np.arange(len(lengths)), lengths)
     out[:, :observation_dim] = observations
-    out[steps, observation_dim:-2] = actions
-    out[steps, -2] = arrays["rewards"]
-    out[steps, -1] = arrays["terminated"]
+    out[steps, observation_dim:columns] = actions
+    for column, name in enumerate(scalars, start=columns):
+        out[steps, column] = arrays[name]
     return lengths

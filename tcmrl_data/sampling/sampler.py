@@ -9,6 +9,7 @@ import numpy.typing as npt
 import torch
 
 from tcmrl_data.dataset.selection import Selection
+from tcmrl_data.envs.base import Reward
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_sequence
 from tcmrl_data.sampling.batch import Batch, Moments
@@ -46,7 +47,7 @@ def open_sampler(
 
     Raises:
         SelectionError: the selection holds test tasks, parts made from them, fewer than two tasks, or too
-            little data of a task.
+            little data of a task, or lacks dense rewards that the request takes.
 
     Example:
         >>> request = BatchRequest(tasks=16, kinds={"context": Trajectories(2)})
@@ -69,7 +70,7 @@ def open_sampler(
             f"meta-training needs at least 2 training tasks, the selection has {len(selection.tasks)}"
         )
     return Sampler(
-        load_rows(selection, memory_limit=memory_limit, say=say),
+        load_rows(selection, dense=request.takes_dense, memory_limit=memory_limit, say=say),
         request,
         seed=seed,
         stream=stream,
@@ -105,7 +106,8 @@ class Sampler:
         device: a torch device.
 
     Raises:
-        SelectionError: a task has too few steps, trajectories or windows for the request.
+        SelectionError: a task has too few steps, trajectories or windows for the request, or the request
+            takes dense rewards that are not loaded.
     """
 
     def __init__(
@@ -123,18 +125,22 @@ class Sampler:
         self._rows, self._place = rows, place
         self._table = place_table(rows.table, self.device)
         sequence = keyed_sequence(seed, environment, NO_TASK, Purpose.SAMPLER, stream)
-        self._sequence, self._endings = sequence, dict[float, Endings]()
+        self._sequence, self._endings = sequence, dict[tuple[float, Reward], Endings]()
         self._serve(request)
 
     def _serve(self, request: BatchRequest) -> None:
+        if request.takes_dense and not self._rows.has_dense:
+            raise SelectionError(
+                f"{self._place}: dense rewards are not loaded; open a sampler for a request that takes them"
+            )
         self.request = request
         self._draws = Draws(self._rows.episodes, request, sequence=self._sequence)
         self._check()
-        endings = None
-        if any(kind.returns for kind in request.kinds.values()):
-            if request.gamma not in self._endings:
-                self._endings[request.gamma] = Endings.of(self._rows, request.gamma)
-            endings = self._endings[request.gamma]
+        endings = {
+            kind.rewards: self._endings_of(request.gamma, kind.rewards)
+            for kind in request.kinds.values()
+            if kind.returns
+        }
         self._gather = Gatherer(
             self._rows,
             self._table,
@@ -144,11 +150,18 @@ class Sampler:
             endings=endings,
         )
 
+    def _endings_of(self, gamma: float, rewards: Reward) -> Endings:
+        key = (gamma, rewards)
+        if key not in self._endings:
+            self._endings[key] = Endings.of(self._rows, gamma, rewards)
+        return self._endings[key]
+
     def with_request(self, request: BatchRequest) -> Self:
         """A sampler for another request with the same steps, seed and stream; loads nothing again.
 
         Raises:
-            SelectionError: a task has too few steps, trajectories or windows for the request.
+            SelectionError: a task has too few steps, trajectories or windows for the request, or the request
+                takes dense rewards and this sampler's does not.
         """
         other = copy.copy(self)
         other._serve(request)

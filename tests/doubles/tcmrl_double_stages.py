@@ -15,6 +15,7 @@ from tcmrl_algo import (
     Problem,
     Stage,
     TrainingSettings,
+    policy_transitions,
 )
 from tcmrl_algo.networks.perceptron import linear
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions
@@ -82,7 +83,7 @@ class StagesMethod(Method[StagesConfig]):
     Config = StagesConfig
 
     def batch_request(self, settings: TrainingSettings, config: StagesConfig) -> BatchRequest:
-        kinds = {"policy": Transitions(settings.batch.transitions), "context": Trajectories(2)}
+        kinds = {"policy": policy_transitions(settings), "context": Trajectories(2)}
         return BatchRequest(settings.batch.tasks, kinds)
 
     def stages(self, settings: TrainingSettings, config: StagesConfig) -> tuple[Stage, ...]:

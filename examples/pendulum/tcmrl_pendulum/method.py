@@ -14,12 +14,13 @@ from torch import Tensor
 
 from tcmrl_algo.context_methods.encoding import ContextEncoder
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.context_methods.requests import policy_transitions
 from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.networks.attention import mean_representation
 from tcmrl_algo.networks.perceptron import Perceptron
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions
+from tcmrl_data import Batch, BatchRequest, Steps, Trajectories
 
 
 class RewardRegressionConfig(MethodConfig):
@@ -75,7 +76,7 @@ class RewardRegression(Method[RewardRegressionConfig]):
         return BatchRequest(
             batch.tasks,
             {
-                "policy": Transitions(batch.transitions),
+                "policy": policy_transitions(settings),
                 "context": Trajectories(batch.context_trajectories),
                 "execution": Trajectories(batch.execution_trajectories, apart_from="context"),
             },
