@@ -208,7 +208,7 @@ def build(
             workers=workers,
             engine=engine,
             address=ray_address,
-            progress=lambda event: _show(event, progress),
+            progress=lambda event: show_build(event, progress),
         )
     if as_json:
         print_json(dataclasses.asdict(report))
@@ -229,7 +229,8 @@ def _parse_tasks(recipe: "Recipe", text: str | None, *, option: str = "--tasks")
     return None if text is None else tcmrl_data.parse_indices(text, recipe.environment.tasks, option=option)
 
 
-def _show(event: "BuildEvent", progress: StageProgress) -> None:
+def show_build(event: "BuildEvent", progress: StageProgress) -> None:
+    """Shows how far a build is."""
     if event.kind in ("unit_failed", "warning"):
         progress.note(event.message)
     progress.update("behavior training", done=event.steps_done, total=event.steps_total, unit="steps")

@@ -1,11 +1,15 @@
 """`tcmrl experiment`: do the runs of an experiment and print tables of their returns."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from tcmrl_data.recipe.profile import PROFILES, Profile
+
+from .building import show_build
 from .frame import (
     duration,
     fail_incomplete,
@@ -18,11 +22,12 @@ from .frame import (
     same_command,
     stopped_by_signals,
 )
+from .progress import StageProgress
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tcmrl_algo import EndedRun, ExperimentReport, RunResult
+    from tcmrl_algo import EndedRun, Experiment, ExperimentReport, RunResult
 
 NUM_SEEDS = 10_000
 
@@ -58,6 +63,16 @@ NUM_SEEDS = 10_000
 @click.option(
     "--only", metavar="LABEL", multiple=True, help="Run only the method with this label; repeatable."
 )
+@click.option(
+    "--environment", "environments", metavar="ENV", multiple=True, help="Run only on this one; repeatable."
+)
+@click.option(
+    "--profile",
+    type=click.Choice(PROFILES),
+    show_default="the file's",
+    help="Size of datasets, networks and training: `paper` is the paper's.",
+)
+@click.option("--build", is_flag=True, help="Build the datasets that do not exist.")
 @click.option("--device", default="cpu", show_default=True, help="PyTorch device, such as cpu or cuda.")
 @output_options
 def experiment(
@@ -69,6 +84,9 @@ def experiment(
     steps: int | None,
     seeds: str | None,
     only: tuple[str, ...],
+    environments: tuple[str, ...],
+    profile: Profile | None,
+    build: bool,
     device: str,
     as_json: bool,
     quiet: bool,
@@ -76,8 +94,10 @@ def experiment(
     """Run an experiment: every method on every environment with every seed.
 
     FILE is a TOML file; NAME is an experiment of --list. All inputs are checked before the first run
-    starts. If the same command is run again, it keeps finished runs and continues interrupted runs from
-    their last checkpoint; the results are those of uninterrupted runs. The workers share the cores.
+    starts; if datasets are missing, the commands that build them are printed, or --build runs them. With
+    --profile, the steps that the file sets give way to the profile's. If the same command is run again, it
+    keeps finished runs and continues interrupted runs from their last checkpoint; the results are those of
+    uninterrupted runs. The workers share the cores.
 
     The results folder contains a JSON document per run in runs/, and table.csv. Returns are undiscounted.
 
@@ -86,6 +106,7 @@ def experiment(
       tcmrl experiment --list
       tcmrl experiment tour --workers 2
       tcmrl experiment figure10 --seeds 0-2 --steps 1000 --out results/short
+      tcmrl experiment figure4_half_cheetah_vel --profile paper --build --data data/paper
       tcmrl experiment mine.toml --data /disk/datasets --only TCMRL --only FOCAL
     """
     from tcmrl_algo import load_experiment, run_experiment
@@ -97,13 +118,17 @@ def experiment(
     if name is None:
         raise click.UsageError("Name a FILE or an experiment of `tcmrl experiment --list`.")
     loaded = load_experiment(name)
-    out = out or Path("results") / loaded.name
+    out = out or Path("results") / (loaded.name if profile is None else f"{loaded.name}-{profile}")
+    loaded = loaded if profile is None else loaded.at_profile(profile)
+    if build:
+        _build(loaded, environments, data=data, workers=workers, quiet=quiet)
     with stopped_by_signals(lambda: same_command(out)):
         report = run_experiment(
             loaded,
             out,
             data=data,
             only=only,
+            environments=environments,
             seeds=None if seeds is None else parse_indices(seeds, NUM_SEEDS, option="--seeds"),
             steps=steps,
             workers=workers,
@@ -127,6 +152,20 @@ def experiment(
         fail_incomplete(f"{report.failed[0]}{more}; run the same command again to repeat the failed runs")
 
 
+def _build(
+    loaded: "Experiment", environments: tuple[str, ...], *, data: Path, workers: int | None, quiet: bool
+) -> None:
+    """Builds the datasets that the experiment lacks, one after another."""
+    from tcmrl_algo import build_missing, missing_datasets
+
+    for missing in missing_datasets(loaded, data):
+        if not environments or missing.environment in environments:
+            remark(f"building: {missing.command}", quiet=quiet)
+            folder = missing.folder
+            with stopped_by_signals(partial(same_command, folder)), StageProgress(quiet=quiet) as progress:
+                build_missing(missing, workers=workers, report=partial(show_build, progress=progress))
+
+
 def _print_list(*, as_json: bool) -> None:
     from tcmrl_algo import experiment_names, load_experiment
 
@@ -142,6 +181,7 @@ def _print_list(*, as_json: bool) -> None:
     )
     for experiment in found:
         num_runs = len(experiment.environments) * len(experiment.methods) * len(experiment.seeds)
+        num_runs *= len(experiment.fold_numbers)
         table.add_row(experiment.name, experiment.title, str(num_runs))
     print_table(table)
 
@@ -156,8 +196,8 @@ def _line(event: "EndedRun") -> str:
         for protocol, evaluation in result.evaluations.items()
     )
     return (
-        f"{event.done} of {event.total}: {result.environment}, {result.method}, seed {result.seed}: "
-        f"{finals}{left}"
+        f"{event.done} of {event.total}: {result.environment}, {result.method}, seed {result.seed}"
+        f"{'' if result.fold is None else f', fold {result.fold}'}: {finals}{left}"
     )
 
 
@@ -177,7 +217,7 @@ def result_tables(environment: str, results: Sequence["RunResult"]) -> list["Tab
     from tcmrl_algo import by_method, summarize
 
     here = [result for result in results if result.environment == environment]
-    columns = ("method", "seeds", "mean", "95%", "other", "regret")
+    columns = ("method", "runs", "mean", "95%", "other", "regret")
     tables = []
     for protocol in here[0].evaluations:
         title = f"{environment}, protocol {protocol}: returns on the test tasks"

@@ -15,7 +15,7 @@ from .progress import StageProgress
     "--out",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    show_default="report in the first of RUNS",
+    show_default="report in the first of RUNS; of an earlier report itself",
     help="Folder of the report.",
 )
 @click.option(
@@ -32,18 +32,23 @@ def report(
 ) -> None:
     """Write a report on finished runs.
 
-    RUNS are results folders of `tcmrl experiment`, or run folders of `tcmrl train`.
+    RUNS are results folders of `tcmrl experiment`, run folders of `tcmrl train`, or earlier reports.
 
     report.md contains final returns, learning curves, t-SNE plots of contexts, attention weights, time
     and memory, the returns of the dataset, the paper's numbers that have the same unit, and a verdict on
-    every claim of an experiment: supported, contradicted, or cannot tell. From five seeds on, 95%
-    bootstrap intervals are printed; with fewer seeds, the values of all seeds. Every table is also
-    written as a CSV file and every figure as a PNG file. Run folders are evaluated first.
+    every claim of an experiment under every protocol: supported, contradicted, or cannot tell, after a
+    correction for the number of verdicts. From five runs on, 95% intervals are printed; with fewer, the
+    values of all. Every table is also written as a CSV file and every figure as a PNG file. Run folders
+    are evaluated first.
+
+    Beside the report stand a small JSON document per run and what was measured of checkpoints and
+    datasets. They are enough to write the same report again, elsewhere and later.
 
     \b
     Examples:
       tcmrl report results/figure5
       tcmrl report results/figure5 results/figure10 --out docs/results/ablations
+      tcmrl report docs/results/ablations
       tcmrl report runs/point-robot-tcmrl-seed0 --out report
       tcmrl report results/figure5 --dataset /disk/point-robot
     """
@@ -52,7 +57,7 @@ def report(
     with StageProgress(quiet=quiet) as progress:
         written = write_report(
             runs,
-            out or runs[0] / "report",
+            out or _default_out(runs[0]),
             datasets=datasets,
             report=lambda stage, done, total: progress.update(stage, done=done, total=total, unit="parts"),
         )
@@ -61,9 +66,14 @@ def report(
         print_json(document | {"report": str(written.report), "files": [str(file) for file in written.files]})
         return
     for verdict in written.verdicts:
-        click.echo(f"{verdict.verdict}: {verdict.claim} ({verdict.environment})")
-    click.echo(f"{written.report}: written, with {len(written.files) - 1} tables and figures")
+        place = ", ".join(filter(None, (verdict.environment, verdict.protocol)))
+        click.echo(f"{verdict.verdict}: {verdict.claim} ({place})")
+    click.echo(f"{written.report}: written, with {len(written.files) - 1} other files")
     remark(
-        "Verdicts compare methods seed by seed: `cannot tell` means that the 95% interval contains 0.",
+        "Verdicts compare methods run by run, corrected for the number of verdicts by Holm's method.",
         quiet=quiet,
     )
+
+
+def _default_out(folder: Path) -> Path:
+    return folder if (folder / "report.md").is_file() else folder / "report"

@@ -16,6 +16,9 @@ from .experiment.aggregate import summarize as summarize
 from .experiment.config import Experiment as Experiment
 from .experiment.config import experiment_names as experiment_names
 from .experiment.config import load_experiment as load_experiment
+from .experiment.datasets import MissingDataset as MissingDataset
+from .experiment.datasets import build_missing as build_missing
+from .experiment.datasets import missing_datasets as missing_datasets
 from .experiment.results import RunResult as RunResult
 from .experiment.results import by_method as by_method
 from .experiment.runner import EndedRun as EndedRun

@@ -1,7 +1,14 @@
 """A small experiment on the tiny dataset, for the tests of experiments and of reports."""
 
+from functools import cache
 from pathlib import Path
 from typing import Any
+
+from tcmrl_algo import TrainingConfig, resolve
+from tcmrl_algo.experiment.config import read_experiment, run_id
+from tcmrl_algo.experiment.results import RunResult
+from tcmrl_data import load_recipe
+from tcmrl_data.foundation.records import write_record
 
 SMALL = {
     "run": {"steps": 40, "log_every": 10, "checkpoint_every": 10, "episodes": 2, "random_episodes": 1},
@@ -38,6 +45,63 @@ def tables(dataset: Path, **changes: Any) -> dict[str, Any]:
             },
         ],
     } | changes
+
+
+@cache
+def _config() -> TrainingConfig:
+    table = {str(name): table for name, table in load_recipe("point-robot").training.items()}["quick"]
+    return resolve(table, place="test")
+
+
+def made_result(
+    method: str,
+    seed: int = 0,
+    final: float = 0.0,
+    *,
+    fold: int | None = None,
+    protocols: tuple[str, ...] = ("offline",),
+    **changes: Any,
+) -> RunResult:
+    """The result of a run that never was, with the same returns under all protocols."""
+    task = {"task": fold or 0, "final": final, "oracle": 0.0, "random": -20.0, "returns": [final, final]}
+    means = {"final": final, "regret": -final, "normalized": 1 + final / 20, "shuffled": final - 1.0}
+    evaluation = {"tasks": [task]} | {f"mean_{name}": value for name, value in means.items()}
+    fields: dict[str, Any] = {
+        "experiment": "small",
+        "method": method,
+        "algorithm": "tcmrl",
+        "privileged": False,
+        "environment": "point-robot",
+        "seed": seed,
+        "fold": fold,
+        "profile": "quick",
+        "dataset": "/data/somewhere",
+        "root": "0" * 64,
+        "steps": 40,
+        "device": "cpu",
+        "threads": 1,
+        "identity": {"root": "0" * 64, "seed": seed},
+        "config": _config(),
+        "versions": {"torch": "2"},
+        "digest": "1" * 64,
+        "curve": (),
+        "evaluations": dict.fromkeys(protocols, evaluation),
+        "training_seconds": 1.0 / 3.0,
+        "evaluation_seconds": 2.0,
+        "peak_memory": 10**8,
+    }
+    return RunResult(**(fields | changes))
+
+
+def write_results(folder: Path, content: dict[str, Any], results: list[RunResult]) -> Path:
+    """A results folder of an experiment with such results."""
+    experiment = read_experiment(content, place="test")
+    (folder / "runs").mkdir(parents=True)
+    write_record(folder / "experiment.json", experiment)
+    for result in results:
+        name = run_id(result.environment, result.method, result.seed, result.fold)
+        write_record(folder / "runs" / f"{name}.json", result)
+    return folder
 
 
 def write_file(file: Path, content: dict[str, Any]) -> Path:

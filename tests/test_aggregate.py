@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcmrl_algo import Summary, summarize
-from tcmrl_algo.experiment.aggregate import mean_interval
+from tcmrl_algo.experiment.aggregate import holm, mean_interval, sign_probability
 from tcmrl_data import TrainingError
 
 
@@ -34,6 +34,22 @@ def test_verdicts_intervals_hold_the_mean_as_often_as_they_say() -> None:
     held = np.mean([low <= 0.0 <= high for low, high in filter(None, intervals)])
     assert 0.94 < held < 0.96
     assert mean_interval([2.0] * 5) == (2.0, 2.0)
+
+
+def test_a_p_value_is_below_a_twentieth_where_the_interval_excludes_zero() -> None:
+    draws = np.random.default_rng(1).normal(loc=0.9, size=(200, 5)).tolist()
+    excluded = [low > 0 or high < 0 for low, high in filter(None, map(mean_interval, draws))]
+    assert [(sign_probability(draw) or 0) < 0.05 for draw in draws] == excluded
+    assert 20 < sum(excluded) < 180
+    assert sign_probability([1.0] * 4) is None
+    assert (sign_probability([2.0] * 5), sign_probability([0.0] * 5)) == (0.0, 1.0)
+
+
+def test_holms_correction_by_hand() -> None:
+    """Smallest first: 0.005 × 4, 0.01 × 3, then 0.03 × 2 and 0.04 × 1, which is raised to the one before."""
+    assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert holm([0.5, 0.9, 0.5]) == [1.0, 1.0, 1.0]
+    assert holm([]) == []
 
 
 def test_a_summary_is_a_function_of_its_values() -> None:

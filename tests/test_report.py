@@ -16,14 +16,16 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import WrittenReport, open_run, run_experiment, write_report
-from tcmrl_algo.experiment.config import Claim, read_experiment
+from tcmrl_algo.experiment.compact import compact
+from tcmrl_algo.experiment.config import read_experiment
 from tcmrl_algo.experiment.results import RunResult
-from tcmrl_algo.reporting.claims import Verdict, judge, measure_result
+from tcmrl_algo.reporting.compose import compose
 from tcmrl_algo.reporting.contexts import Stored, TrainedContexts, distance_ratio, embed
 from tcmrl_algo.reporting.figures import draw_embeddings
 from tcmrl_algo.reporting.sections import attention_table, final_table, published, published_table
 from tcmrl_algo.reporting.sources import FinishedRun, labels_of, read_sources
 from tcmrl_algo.reporting.tables import Table, across_seeds
+from tcmrl_algo.reporting.write import measure_paths, page_text
 from tcmrl_data import Dataset
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
@@ -56,81 +58,6 @@ def trained(results: Path) -> FinishedRun:
     """The finished run of TCMRL."""
     folder = results / "runs/point-robot--tcmrl--seed0"
     return FinishedRun(read_record(RunResult, folder.with_name(f"{folder.name}.json")), folder)
-
-
-def _with_finals(run: FinishedRun, method: str, finals: list[float]) -> list[FinishedRun]:
-    """Copies of a run, one per final return, with the seeds 0, 1 and so on."""
-    document = run.result.evaluations["offline"]
-    return [
-        replace(
-            run,
-            result=run.result.model_copy(
-                update={
-                    "method": method,
-                    "seed": seed,
-                    "evaluations": {"offline": document | {"mean_final": final, "mean_regret": -final}},
-                }
-            ),
-        )
-        for seed, final in enumerate(finals)
-    ]
-
-
-def _judge(claim: Claim, runs: list[FinishedRun]) -> Verdict:
-    return judge(
-        claim,
-        "point-robot",
-        runs,
-        protocol="offline",
-        measure=lambda run, metric, protocol: measure_result(run.result, metric, protocol),
-    )
-
-
-@pytest.mark.parametrize(
-    ("better", "worse", "metric", "verdict"),
-    [
-        ([2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 2.0, 3.0, 4.0, 5.0], "final", "supported"),
-        ([1.0, 2.0, 3.0, 4.0, 5.0], [2.0, 3.0, 4.0, 5.0, 6.0], "final", "contradicted"),
-        ([1.0, 5.0, 1.0, 5.0, 1.0], [5.0, 1.0, 5.0, 1.0, 1.0], "final", "cannot tell"),
-        ([0.1, 1.4, 0.1, 0.6, 0.5], [0.0, 0.0, 0.0, 0.0, 0.0], "final", "cannot tell"),  # by bootstrap not
-        ([9.0, 9.0, 9.0, 9.0], [1.0, 1.0, 1.0, 1.0], "final", "cannot tell"),  # too few seeds
-        ([2.0, 3.0, 4.0, 5.0, 6.0], [1.0, 2.0, 3.0, 4.0, 5.0], "regret", "supported"),  # lower is better
-    ],
-)
-def test_a_verdict_follows_from_paired_differences(
-    trained: FinishedRun, better: list[float], worse: list[float], metric: str, verdict: str
-) -> None:
-    claim = Claim(text="A beats B", better="A", worse="B", metric=metric)  # type: ignore[arg-type]
-    runs = [*_with_finals(trained, "A", better), *_with_finals(trained, "B", worse)]
-    found = _judge(claim, runs)
-    assert found.verdict == verdict
-    assert found.differences == tuple(a - b for a, b in zip(better, worse, strict=True))
-
-
-def test_differences_are_paired_by_seed_and_large_common_noise_cancels(trained: FinishedRun) -> None:
-    noise = [-100.0, 50.0, 3.0, 77.0, -20.0]
-    better = _with_finals(trained, "A", [value + 1.0 for value in noise])
-    worse = _with_finals(trained, "B", noise)
-    found = _judge(Claim(text="", better="A", worse="B"), [*better, *worse[::-1]])
-    assert (found.verdict, found.low, found.high) == ("supported", 1.0, 1.0)
-    found = _judge(Claim(text="", better="A", worse="B"), [*better[:4], *worse[1:]])
-    assert found.seeds == (1, 2, 3)
-
-
-def test_a_verdict_marks_a_method_that_observes_task_parameters(trained: FinishedRun) -> None:
-    finals = [1.0, 2.0]
-    control = [
-        replace(run, result=run.result.model_copy(update={"privileged": True}))
-        for run in _with_finals(trained, "B", finals)
-    ]
-    found = _judge(Claim(text="", better="A", worse="B"), [*_with_finals(trained, "A", finals), *control])
-    assert found.comparison == "A (final) against B (privileged) (final), offline"
-
-
-def test_one_method_under_two_metrics_makes_a_claim(trained: FinishedRun) -> None:
-    claim = Claim(text="", better="TCMRL", worse="TCMRL", against="shuffled")
-    means = trained.result.evaluations["offline"]
-    assert _judge(claim, [trained]).differences == (means["mean_final"] - means["mean_shuffled"],)
 
 
 def test_contexts_within_a_task_over_contexts_between_tasks() -> None:
@@ -168,7 +95,9 @@ def test_attention_is_relative_and_makes_the_context(trained: FinishedRun, tiny:
     assert np.mean(weights.by_step) == pytest.approx(1.0, abs=1e-5)
     assert weights.example.sum() == pytest.approx(len(weights.example), abs=1e-4)
     assert (len(weights.zero), len(weights.nonzero)) == (0, 0)  # no dense reward is zero
-    assert attention_table("a", "point-robot", [("TCMRL", [weights])]) is None
+    measured = trained.result.model_copy(update={"contexts": found.measures()})
+    assert measured.contexts is not None and measured.contexts.tasks == len(stored.tasks)
+    assert attention_table("a", "point-robot", [measured]) is None
     assert found.contexts is not None and found.contexts.shape == (len(stored.lanes), 4)
 
 
@@ -179,12 +108,14 @@ def test_weights_of_rewarded_transitions_are_told_apart(trained: FinishedRun, ti
     rewards[3] = 1.0
     stored.tasks = stored.tasks[:2]
     stored.trajectories = [[replace(trajectory, rewards=rewards)], [trajectory]]
-    weights = TrainedContexts(trained, stored).weights
+    found = TrainedContexts(trained, stored)
+    weights = found.weights
     assert weights is not None
     assert (len(weights.zero), len(weights.nonzero)) == (len(trajectory) - 1, 1)
     total = weights.zero.sum() + weights.nonzero.sum()
     assert total == pytest.approx(len(trajectory), abs=1e-4)
-    table = attention_table("a", "sparse-point-robot", [("TCMRL", [weights])])
+    measured = trained.result.model_copy(update={"contexts": found.measures()})
+    table = attention_table("a", "sparse-point-robot", [measured])
     assert table is not None
     assert [row[1] for row in table.rows] == ["nonzero reward", "zero reward"]
     assert table.rows[0][-2:] == (0.0009839126, 0.0009260265)
@@ -231,7 +162,7 @@ def test_a_report_holds_every_section_and_every_file_it_names(report: WrittenRep
     assert set(re.findall(r"\]\((.+?\.png)\)", text)) == {
         file.name for file in report.files if file.suffix == ".png"
     }
-    assert {file.name for file in report.report.parent.iterdir()} == {file.name for file in report.files}
+    assert {file for file in report.report.parent.rglob("*") if file.is_file()} == set(report.files)
     for file in report.files:
         assert file.stat().st_size > 0
         if file.suffix == ".png":
@@ -242,7 +173,8 @@ def test_a_report_holds_every_section_and_every_file_it_names(report: WrittenRep
     assert digests.name in text and result.digest in digests.read_text()
     table = final_table("x", [result])
     assert f"{table.rows[0][3]:.4g}" in text
-    assert [verdict.verdict for verdict in report.verdicts] == ["cannot tell"] * 2
+    assert [verdict.verdict for verdict in report.verdicts] == ["cannot tell"] * 3
+    assert [verdict.protocol for verdict in report.verdicts] == ["offline", "paper", None]
 
 
 def test_dataset_returns_are_those_of_its_parts(report: WrittenReport, tiny: Dataset) -> None:
@@ -287,7 +219,7 @@ def test_claims_of_several_experiments_stand_together_first(copy: Path, tmp_path
 def test_a_report_without_checkpoints_says_what_is_left_out(copy: Path, call: Call) -> None:
     code, output, _ = call("report", copy)
     assert code == 0
-    assert "cannot tell: TCMRL ends higher (point-robot)" in output
+    assert "cannot tell: TCMRL ends higher (point-robot, offline)" in output
     text = (copy / "report/report.md").read_text()
     assert "are omitted: " in text and "is no run" in text and "Time and memory" in text
 
@@ -300,10 +232,41 @@ def test_a_report_names_the_runs_that_are_missing_and_why(copy: Path) -> None:
     report = write_report([copy], copy / "report")
     text = report.report.read_text()
     assert f"1 of its runs, `{lost.name}` (loss/critic is not finite at step 7)" in text
-    assert [verdict.seeds for verdict in report.verdicts] == [
-        (),
-        (),
-    ]  # no run to compare, no checkpoint to look at
+    assert [verdict.pairs for verdict in report.verdicts] == [(), (), ()]  # no run, no checkpoint
+
+
+def _texts(folder: Path) -> dict[str, bytes]:
+    files = [file for file in folder.rglob("*") if file.is_file() and file.suffix != ".png"]
+    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
+
+
+def test_a_report_is_made_again_from_what_stands_beside_it(report: WrittenReport, tmp_path: Path) -> None:
+    moved = tmp_path / "moved"
+    shutil.copytree(report.report.parent, moved)
+    before = _texts(moved)
+    page, judged = compose(measure_paths([moved]), moved)
+    assert page_text(page) == report.report.read_text()
+    assert {f"{table.name}.csv": table.csv().encode() for table in page.tables}.items() <= before.items()
+    assert tuple(judged["small"]) == report.verdicts
+    written = write_report([moved], moved)
+    assert _texts(moved) == before
+    assert {file.name for file in written.files} == {file.name for file in report.files}
+
+
+def test_committed_results_are_small_and_name_no_path(report: WrittenReport, trained: FinishedRun) -> None:
+    file = report.report.parent / "runs/point-robot--tcmrl--seed0.json"
+    result = read_record(RunResult, file)
+    assert file.stat().st_size < 6_000
+    assert (result.dataset, result.identity) == ("", {})
+    assert result == compact(result)
+    assert result.contexts is not None and result.contexts.context_ratio is not None
+    for protocol, evaluation in result.evaluations.items():
+        exact = trained.result.evaluations[protocol]["mean_final"]
+        assert evaluation["mean_final"] == float(f"{exact:.6g}")
+        assert "returns" not in evaluation["tasks"][0]
+    for path in report.files:
+        if path.suffix != ".png":
+            assert trained.result.dataset not in path.read_text()
 
 
 def test_what_is_no_run_is_refused(results: Path, tmp_path: Path, call: Call) -> None:

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data import TrainingError
+from tcmrl_data import Profile, TrainingError
 from tcmrl_data.foundation.plugins import unknown_name
 from tcmrl_data.foundation.validation import validate_table
 
@@ -23,10 +23,11 @@ Metric = Literal[
     "shuffled",
     "training_seconds",
     "peak_memory",
+    "context_ratio",
     "attention_zero",
     "attention_nonzero",
 ]
-"""What a claim compares; `reporting.measures` says how a run gives them."""
+"""What a claim compares; `reporting.claims` says how a run gives them."""
 
 PAPER_PROTOCOLS = ("paper", "offline", "idaq")
 """By which the paper adapts, in its order; what an experiment evaluates by unless it says otherwise."""
@@ -41,11 +42,13 @@ class EnvironmentChoice(_Table):
 
     Attributes:
         dataset: its folder; `NAME` below the folder of datasets where unset.
+        dataset_profile: the profile that its dataset is built with; any where unset.
         profile: whose training table to start from; the one the dataset was built with where unset.
         training: changes of that table.
     """
 
     dataset: str | None = None
+    dataset_profile: Profile | None = None
     profile: str | None = None
     training: dict[str, Any] = {}
 
@@ -71,7 +74,8 @@ class Claim(_Table):
         worse: label of the method that it is held against; may be the same, with another metric.
         metric: what is compared; a lower regret, time or memory is better, a higher anything else.
         against: what is taken from `worse`, where that is another metric.
-        protocol: of evaluation; the experiment's first where unset.
+        protocols: of evaluation, under each of which the claim is judged; all of the experiment's where
+            empty. A metric that does not depend on the protocol is judged once.
     """
 
     text: str
@@ -79,7 +83,7 @@ class Claim(_Table):
     worse: str
     metric: Metric = "final"
     against: Metric | None = None
-    protocol: str | None = None
+    protocols: tuple[str, ...] = ()
 
 
 class Experiment(_Table):
@@ -90,6 +94,8 @@ class Experiment(_Table):
         title: one line.
         source: the figure or table of the paper that it stands for.
         seeds: every method is run with every seed.
+        folds: into how many folds the tasks of a dataset are cut, each of which is the test split once; the
+            dataset's own split where unset. Every method is run with every seed on every fold.
         environments: by name.
         methods: by label, in the order of tables and figures.
         training: changes of the training table that all runs share.
@@ -103,6 +109,7 @@ class Experiment(_Table):
     title: str
     source: str
     seeds: tuple[int, ...] = Field(min_length=1)
+    folds: int | None = Field(default=None, ge=2)
     environments: dict[str, EnvironmentChoice] = Field(min_length=1)
     methods: dict[str, MethodChoice] = Field(min_length=1)
     training: dict[str, Any] = {}
@@ -123,12 +130,44 @@ class Experiment(_Table):
                 if label not in self.methods:
                     known = ", ".join(map(repr, self.methods))
                     raise ValueError(f"claim {claim.text!r} names no method {label!r}; they are {known}")
-            if claim.protocol not in (None, *self.protocols):
-                raise ValueError(
-                    f"claim {claim.text!r}: protocol {claim.protocol!r} is not evaluated; "
-                    f"protocols are {', '.join(self.protocols)}"
-                )
+            for protocol in claim.protocols:
+                if protocol not in self.protocols:
+                    raise ValueError(
+                        f"claim {claim.text!r}: protocol {protocol!r} is not evaluated; "
+                        f"protocols are {', '.join(self.protocols)}"
+                    )
         return self
+
+    @property
+    def fold_numbers(self) -> tuple[int | None, ...]:
+        """The folds; (None,) for the dataset's own split."""
+        return (None,) if self.folds is None else tuple(range(self.folds))
+
+    def at_profile(self, profile: Profile) -> "Experiment":
+        """The same experiment with another profile's datasets and training tables.
+
+        A number of training steps that the file sets belongs to the file's profile and is dropped.
+        """
+        environments = {
+            name: choice.model_copy(
+                update={
+                    "profile": profile,
+                    "dataset_profile": profile,
+                    "training": _without_steps(choice.training),
+                }
+            )
+            for name, choice in self.environments.items()
+        }
+        methods = {
+            label: method.model_copy(update={"training": _without_steps(method.training)})
+            for label, method in self.methods.items()
+        }
+        changes = {
+            "environments": environments,
+            "methods": methods,
+            "training": _without_steps(self.training),
+        }
+        return self.model_copy(update=changes)
 
     def to_json(self) -> dict[str, Any]:
         """What `read_experiment` takes back."""
@@ -182,9 +221,10 @@ def folder_name(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
 
 
-def run_id(environment: str, method: str, seed: int) -> str:
+def run_id(environment: str, method: str, seed: int, fold: int | None = None) -> str:
     """Names a run's files in a results folder."""
-    return f"{folder_name(environment)}--{folder_name(method)}--seed{seed}"
+    part = "" if fold is None else f"--fold{fold}"
+    return f"{folder_name(environment)}--{folder_name(method)}--seed{seed}{part}"
 
 
 def override_texts(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
@@ -194,6 +234,13 @@ def override_texts(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
             yield from override_texts(value, f"{prefix}{key}.")
         else:
             yield f"{prefix}{key}={json.dumps(value)}"
+
+
+def _without_steps(training: Mapping[str, Any]) -> dict[str, Any]:
+    changes = dict(training)
+    if isinstance(run := changes.get("run"), Mapping):
+        changes["run"] = {key: value for key, value in run.items() if key != "steps"}
+    return changes
 
 
 def _shipped() -> Traversable:

@@ -30,7 +30,7 @@ class Job(BaseModel):
     """What a worker is told; kept as `job.json` in the run's folder.
 
     Attributes:
-        experiment, method, environment, seed, profile: which run it is.
+        experiment, method, environment, seed, fold, profile: which run it is.
         dataset, root: what it learns from, by an absolute path.
         folder: the run's, absolute; the result is written beside it.
         identity: of `PlannedRun`.
@@ -45,6 +45,7 @@ class Job(BaseModel):
     method: str
     environment: str
     seed: int
+    fold: int | None = None
     profile: str
     dataset: str
     root: str
@@ -146,7 +147,7 @@ def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: Mapping[str, E
     steps = run.record.steps
     return RunResult(
         **job.model_dump(
-            include={"experiment", "method", "environment", "seed", "profile", "dataset", "root"}
+            include={"experiment", "method", "environment", "seed", "fold", "profile", "dataset", "root"}
         ),
         algorithm=job.config.settings.run.algorithm,
         privileged=run.record.privileged,

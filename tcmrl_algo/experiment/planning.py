@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
-from tcmrl_algo.experiment.config import EnvironmentChoice, Experiment, override_texts, run_id
+from tcmrl_algo.experiment.config import Experiment, override_texts, run_id
+from tcmrl_algo.experiment.datasets import fold_datasets, open_datasets
 from tcmrl_algo.training.config import TrainingConfig, installed_table, resolve
-from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError, open_dataset
+from tcmrl_data import CheckpointError, Dataset, TcmrlError, TrainingError
 
 
 @dataclass(frozen=True)
@@ -17,8 +18,9 @@ class PlannedRun:
 
     Attributes:
         id: names its files.
-        environment, method, seed: which run it is.
+        environment, method, seed, fold: which run it is.
         dataset, root: what it learns from.
+        test_tasks: indices of the tasks that it does not see; folds of a dataset share a root.
         profile: whose training table it starts from.
         config: the resolved configuration; its `run.threads` is the driver's to set.
         protocols, curve_points: how it is evaluated.
@@ -28,8 +30,10 @@ class PlannedRun:
     environment: str
     method: str
     seed: int
+    fold: int | None
     dataset: Path
     root: str
+    test_tasks: tuple[int, ...]
     profile: str
     config: TrainingConfig
     protocols: tuple[str, ...]
@@ -41,6 +45,7 @@ class PlannedRun:
         del config["settings"]["run"]["threads"]
         return {
             "root": self.root,
+            "test_tasks": list(self.test_tasks),
             "seed": self.seed,
             "training": config["settings"] | {self.config.settings.run.algorithm: config["method"]},
             "protocols": list(self.protocols),
@@ -52,6 +57,8 @@ def plan_runs(
     experiment: Experiment,
     *,
     data: Path,
+    views: Path | None = None,
+    environments: Sequence[str] = (),
     seeds: Sequence[int] | None = None,
     steps: int | None = None,
 ) -> list[PlannedRun]:
@@ -60,37 +67,77 @@ def plan_runs(
     Args:
         experiment: the file.
         data: folder of datasets, one per environment; or one dataset, whatever the file says of its place.
+        views: folder for the view files of folds, needed if the experiment has folds. They are written after
+            all else was checked.
+        environments: instead of all of the experiment's.
         seeds: instead of the experiment's.
         steps: training steps instead of `run.steps`, of runs and schedules.
 
     Raises:
-        SelectionError: a dataset is missing, of another environment, without test tasks, or without the
-            snapshots that a method needs.
+        SelectionError: a dataset is missing, of another environment or profile, without test tasks, or
+            without the snapshots that a method needs.
         TrainingError: an unknown method, algorithm, profile or protocol, or changes that do not validate.
     """
     _check_protocols(experiment)
-    runs = []
-    for environment, choice in experiment.environments.items():
-        dataset = _dataset(environment, choice, data)
-        profile = choice.profile or dataset.manifest.profile
-        configs = {label: _config(experiment, dataset, profile, label, steps) for label in experiment.methods}
-        runs += [
-            PlannedRun(
-                id=run_id(environment, label, seed),
-                environment=environment,
-                method=label,
-                seed=seed,
-                dataset=dataset.path.resolve(),
-                root=dataset.manifest.root,
-                profile=profile,
-                config=config,
-                protocols=experiment.protocols,
-                curve_points=experiment.curve_points,
-            )
-            for seed in (experiment.seeds if seeds is None else seeds)
-            for label, config in configs.items()
-        ]
-    return runs
+    experiment = _on(experiment, environments)
+    datasets = open_datasets(experiment, data)
+    profiles = {
+        environment: choice.profile or datasets[environment].manifest.profile
+        for environment, choice in experiment.environments.items()
+    }
+    configs = {
+        environment: {
+            label: _config(experiment, dataset, profiles[environment], label, steps)
+            for label in experiment.methods
+        }
+        for environment, dataset in datasets.items()
+    }
+    splits = {environment: _splits(experiment, dataset, views) for environment, dataset in datasets.items()}
+    return [
+        PlannedRun(
+            id=run_id(environment, label, seed, fold),
+            environment=environment,
+            method=label,
+            seed=seed,
+            fold=fold,
+            dataset=dataset.path.resolve(),
+            root=dataset.manifest.root,
+            test_tasks=tuple(task.index for task in dataset.test_tasks),
+            profile=profiles[environment],
+            config=config,
+            protocols=experiment.protocols,
+            curve_points=experiment.curve_points,
+        )
+        for environment in datasets
+        for seed in (experiment.seeds if seeds is None else seeds)
+        for fold, dataset in splits[environment].items()
+        for label, config in configs[environment].items()
+    ]
+
+
+def _on(experiment: Experiment, environments: Sequence[str]) -> Experiment:
+    """The experiment in these environments; in all of its own where none is named.
+
+    Raises:
+        TrainingError: it has no such environment.
+    """
+    unknown = [name for name in environments if name not in experiment.environments]
+    if unknown:
+        known = ", ".join(map(repr, experiment.environments))
+        raise TrainingError(
+            f"--environment {unknown[0]!r}: {experiment.name} has no such environment; they are {known}"
+        )
+    chosen = {name: choice for name, choice in experiment.environments.items() if name in environments}
+    return experiment.model_copy(update={"environments": chosen}) if environments else experiment
+
+
+def _splits(experiment: Experiment, dataset: Dataset, views: Path | None) -> dict[int | None, Dataset]:
+    """The dataset itself under None, or its folds by number."""
+    if experiment.folds is None:
+        return {None: dataset}
+    if views is None:
+        raise TrainingError(f"experiment {experiment.name!r} has folds; say where their view files are made")
+    return dict(enumerate(fold_datasets(dataset, views, experiment.folds)))
 
 
 def check_same(done: Mapping[str, Any], planned: Mapping[str, Any], *, place: Path) -> None:
@@ -114,27 +161,6 @@ def _check_protocols(experiment: Experiment) -> None:
             PROTOCOLS.get(protocol)
         except TcmrlError as error:
             raise TrainingError(f"experiment {experiment.name!r}, protocols: {error}") from None
-
-
-def _dataset(environment: str, choice: EnvironmentChoice, data: Path) -> Dataset:
-    folder = Path(choice.dataset) if choice.dataset else data / environment
-    if (data / "manifest.json").is_file():
-        folder = data
-    if not (folder / "manifest.json").is_file():
-        profile = f" --profile {choice.profile}" if choice.profile else ""
-        raise SelectionError(
-            f"no dataset of {environment!r} at {folder}; build it with "
-            f"`tcmrl-data build {environment}{profile} --out {folder}`, or say with --data where it lies"
-        )
-    dataset = open_dataset(folder)
-    if dataset.name != environment:
-        raise SelectionError(f"{folder} holds {dataset.name!r}, the experiment needs {environment!r}")
-    if not dataset.test_tasks or len(dataset.train_tasks) < 2:
-        raise SelectionError(
-            f"{folder} holds {len(dataset.train_tasks)} training and {len(dataset.test_tasks)} test tasks, "
-            f"an experiment needs 2 and 1; extend it with `tcmrl-data build {environment} --tasks`"
-        )
-    return dataset
 
 
 def resolve_method(

@@ -18,6 +18,7 @@ COLUMNS = (
     "algorithm",
     "privileged",
     "seed",
+    "fold",
     "protocol",
     "final",
     "regret",
@@ -65,12 +66,33 @@ class CurvePoint(_Record):
     device_memory: int
 
 
+class ContextMeasures(_Record):
+    """What a report measures of a run's contexts and attention; it needs the checkpoint and the dataset.
+
+    Attributes:
+        tasks: number of tasks with stored trajectories that were encoded.
+        context_ratio: mean distance between contexts of one task over that between contexts of two tasks;
+            None for a method without contexts.
+        attention_zero, attention_nonzero: mean attention to transitions without and with reward, where
+            uniform attention is 1; None for a method without attention, or without both kinds.
+        median_zero, median_nonzero: medians of the same.
+    """
+
+    tasks: int
+    context_ratio: float | None = None
+    attention_zero: float | None = None
+    attention_nonzero: float | None = None
+    median_zero: float | None = None
+    median_nonzero: float | None = None
+
+
 class RunResult(_Record):
     """A finished run: where it came from, what it learned, what it took.
 
     Attributes:
         experiment, method, algorithm, environment, seed, profile: which run this is.
         privileged: whether the method is a control that sees task parameters.
+        fold: which fold of the tasks is its test split, in an experiment with folds.
         dataset, root: the dataset and its Merkle root.
         steps, device, threads: of training; results depend on device and threads in their last bits.
         identity: everything that the result is a function of, beside the code.
@@ -83,6 +105,7 @@ class RunResult(_Record):
             them; None where none was timed.
         evaluation_seconds: of all evaluations.
         peak_memory: bytes, of the process, or of the CUDA device where there is one.
+        contexts: what a report measured of its contexts; None before, and without a checkpoint.
     """
 
     schema_version: Literal[1] = 1
@@ -92,6 +115,7 @@ class RunResult(_Record):
     privileged: bool
     environment: str
     seed: int
+    fold: int | None = None
     profile: str
     dataset: str
     root: str
@@ -107,6 +131,12 @@ class RunResult(_Record):
     training_seconds: float | None
     evaluation_seconds: float | None
     peak_memory: int | None
+    contexts: ContextMeasures | None = None
+
+    @property
+    def pair(self) -> tuple[int, int | None]:
+        """Seed and fold, by which runs of two methods are compared."""
+        return self.seed, self.fold
 
     @property
     def label(self) -> str:
@@ -133,6 +163,28 @@ def table_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = COLUM
     return stream.getvalue()
 
 
+def coverage(results: Sequence[RunResult]) -> str:
+    """What an interval over these runs covers, such as `5 seeds, 1 split, 4 test tasks`.
+
+    Runs without folds share one split of one dataset, so that an interval over them covers the training
+    alone. With folds every task is a test task in one of them: it covers training on these splits.
+    """
+    seeds, folds = {result.seed for result in results}, {result.fold for result in results}
+    tasks = {
+        (task["task"], result.environment)
+        for result in results
+        for evaluation in result.evaluations.values()
+        for task in evaluation["tasks"]
+    }
+    runs = _count(len(seeds), "seed")
+    if folds - {None}:
+        whole = len(results) % (len(seeds) * len(folds)) == 0
+        runs = f"{'' if whole else f'{len(results)} of '}{runs} × {_count(len(folds), 'fold')}"
+    else:
+        runs += ", 1 split"
+    return f"{runs}, {_count(len(tasks), 'test task')}" if results else "no run"
+
+
 def by_method(results: Iterable[RunResult]) -> dict[str, list[RunResult]]:
     """Results of every method, in the order given, by its `label`."""
     found: dict[str, list[RunResult]] = {}
@@ -152,7 +204,7 @@ def error_file(folder: Path) -> Path:
 
 
 def read_results(folder: Path, experiment: Experiment) -> list[RunResult]:
-    """Every finished run in a results folder by environment, method (as the experiment orders them) and seed.
+    """Every finished run in a results folder, by environment, method (in the file's order), fold and seed.
 
     Raises:
         CheckpointError: a result is not what a run writes.
@@ -160,4 +212,13 @@ def read_results(folder: Path, experiment: Experiment) -> list[RunResult]:
     results = [read_record(RunResult, file, remedy=AGAIN) for file in sorted(folder.glob("runs/*.json"))]
     order = list(experiment.methods)
     known = [result for result in results if result.method in order]
-    return sorted(known, key=lambda result: (result.environment, order.index(result.method), result.seed))
+
+    def place(result: RunResult) -> tuple[str, int, int, int]:
+        fold = -1 if result.fold is None else result.fold
+        return result.environment, order.index(result.method), fold, result.seed
+
+    return sorted(known, key=place)
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"

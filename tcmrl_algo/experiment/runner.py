@@ -70,6 +70,7 @@ def run_experiment(
     *,
     data: str | Path = "data",
     only: Sequence[str] = (),
+    environments: Sequence[str] = (),
     seeds: Sequence[int] | None = None,
     steps: int | None = None,
     workers: int | None = None,
@@ -83,6 +84,7 @@ def run_experiment(
         out: the results folder; a second call goes on in it.
         data: folder of datasets, one per environment; or one dataset.
         only: labels of methods; all where empty.
+        environments: names of environments; all where empty.
         seeds: instead of the experiment's.
         steps: training steps instead of `run.steps`.
         workers: runs at a time, one per core where None. Each gets its share of the cores as threads,
@@ -100,7 +102,9 @@ def run_experiment(
     """
     began, out, cores = time.perf_counter(), Path(out), len(os.sched_getaffinity(0))
     usable_device(device)
-    every = plan_runs(experiment, data=Path(data), seeds=seeds, steps=steps)
+    every = plan_runs(
+        experiment, data=Path(data), views=out / "folds", environments=environments, seeds=seeds, steps=steps
+    )
     before = _finished(every, out, experiment)
     plan = _chosen(every, experiment, only)
     workers = workers or cores
@@ -156,11 +160,11 @@ def _finished(plan: Sequence[PlannedRun], out: Path, experiment: Experiment) -> 
     Raises:
         CheckpointError: one of them differs from the planned runs in more than its seed.
     """
-    planned = {(run.environment, run.method): run.identity() for run in plan}
+    planned = {(run.environment, run.method, run.fold): run.identity() for run in plan}
     found = {}
     for result in read_results(out, experiment):
-        name = run_id(result.environment, result.method, result.seed)
-        identity = planned.get((result.environment, result.method), result.identity)
+        name = run_id(result.environment, result.method, result.seed, result.fold)
+        identity = planned.get((result.environment, result.method, result.fold), result.identity)
         check_same(result.identity, identity | {"seed": result.seed}, place=result_file(out / "runs" / name))
         found[name] = result
     return found
@@ -184,6 +188,7 @@ def _job(run: PlannedRun, experiment: Experiment, out: Path, *, threads: int, de
         method=run.method,
         environment=run.environment,
         seed=run.seed,
+        fold=run.fold,
         profile=run.profile,
         dataset=str(run.dataset),
         root=run.root,

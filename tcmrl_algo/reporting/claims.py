@@ -1,103 +1,145 @@
-"""Verdicts on the claims of an experiment, from the differences between two methods seed by seed."""
+"""Verdicts on the claims of an experiment, from the differences between two methods run by run."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from statistics import fmean
 
-from tcmrl_algo.experiment.aggregate import mean_interval
+from tcmrl_algo.experiment.aggregate import CONFIDENCE, holm, mean_interval, sign_probability
 from tcmrl_algo.experiment.config import Claim, Metric
-from tcmrl_algo.experiment.results import RunResult
-from tcmrl_algo.reporting.sources import FinishedRun
+from tcmrl_algo.experiment.results import RunResult, coverage
+from tcmrl_algo.reporting.sources import Source
 
-LOWER_IS_BETTER = frozenset({"regret", "training_seconds", "peak_memory"})
+LOWER_IS_BETTER = frozenset({"regret", "training_seconds", "peak_memory", "context_ratio"})
+WITHOUT_PROTOCOL = frozenset(
+    {"curve", "training_seconds", "peak_memory", "context_ratio", "attention_zero", "attention_nonzero"}
+)
+"""Metrics of a run, whatever it is evaluated by; the curve is that of the experiment's first protocol."""
 SUPPORTED, CONTRADICTED, UNDECIDED = "supported", "contradicted", "cannot tell"
-
-Measure = Callable[[FinishedRun, Metric, str], float | None]
-"""Returns the value of a run's metric with a protocol, None if it has none."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """Verdict on a claim in one environment.
+    """Verdict on a claim in one environment, under one protocol.
 
     Attributes:
         claim: text of the claim.
         environment: name of the environment.
         comparison: the methods and metrics that were compared; privileged methods are marked.
-        seeds: seeds that both methods have.
-        differences: one per seed, positive if `better` is better.
+        protocol: of evaluation; None if the metrics do not depend on it.
+        pairs: seed and fold of the runs that both methods have; the fold is None without folds.
+        differences: one per pair, positive if `better` is better.
         mean: mean of the differences; None if there are none.
-        low, high: 95% interval of the mean by Student's t; None with fewer than five seeds.
-        verdict: `supported` if the interval is above 0, `contradicted` if it is below 0, else `cannot tell`.
+        low, high: 95% interval of the mean by Student's t, uncorrected; None with fewer than five pairs.
+        probability: two-sided p value against a mean of 0, with Student's t; None as the interval.
+        adjusted: the p value, corrected for all verdicts of the experiment by Holm's method.
+        covers: what interval and p value cover: numbers of seeds, folds and test tasks.
+        verdict: `supported` or `contradicted`, by the sign of the mean, if `adjusted` is below 0.05, else
+            `cannot tell`.
     """
 
     claim: str
     environment: str
     comparison: str
-    seeds: tuple[int, ...]
+    protocol: str | None
+    pairs: tuple[tuple[int, int | None], ...]
     differences: tuple[float, ...]
     mean: float | None
     low: float | None
     high: float | None
+    probability: float | None
+    adjusted: float | None
+    covers: str
     verdict: str
 
 
-def judge(
-    claim: Claim, environment: str, runs: Sequence[FinishedRun], *, protocol: str, measure: Measure
-) -> Verdict:
-    """The verdict on a claim.
+def judge(source: Source) -> list[Verdict]:
+    """Verdicts on all claims of an experiment, in its environments, under its protocols."""
+    compared = [
+        compare(claim, environment, source.results(environment), protocol=protocol)
+        for claim in source.experiment.claims
+        for environment in source.environments()
+        for protocol in _protocols(claim, source.experiment.protocols)
+    ]
+    return correct(compared)
+
+
+def correct(verdicts: Sequence[Verdict]) -> list[Verdict]:
+    """The verdicts, each after Holm's correction for the number of those that have a p value."""
+    adjusted = iter(holm([found.probability for found in verdicts if found.probability is not None]))
+    return [
+        found if found.probability is None else _decided(replace(found, adjusted=next(adjusted)))
+        for found in verdicts
+    ]
+
+
+def compare(claim: Claim, environment: str, results: Sequence[RunResult], *, protocol: str | None) -> Verdict:
+    """The comparison that a claim asks for; `correct` decides what it says.
 
     Args:
         claim: the claim.
         environment: name of the environment.
-        runs: finished runs in the environment.
-        protocol: the protocol, unless the claim names one.
-        measure: returns the value of a run's metric.
+        results: of the runs in the environment.
+        protocol: the protocol; None for metrics that do not depend on it.
     """
-    protocol, against = claim.protocol or protocol, claim.against or claim.metric
-    better = _by_seed(runs, claim.better, claim.metric, protocol, measure)
-    worse = _by_seed(runs, claim.worse, against, protocol, measure)
-    seeds = tuple(sorted(better.keys() & worse.keys()))
+    against = claim.against or claim.metric
+    better = _by_pair(results, claim.better, claim.metric, protocol)
+    worse = _by_pair(results, claim.worse, against, protocol)
+    pairs = tuple(sorted(better.keys() & worse.keys(), key=str))
     sign = -1.0 if claim.metric in LOWER_IS_BETTER else 1.0
-    differences = tuple(sign * (better[seed] - worse[seed]) for seed in seeds)
+    differences = tuple(sign * (better[pair] - worse[pair]) for pair in pairs)
     low, high = mean_interval(differences) or (None, None)
-    labels = {run.result.method: run.result.label for run in runs}
+    labels = {result.method: result.label for result in results}
     left, right = (labels.get(method, method) for method in (claim.better, claim.worse))
+    used = [result for result in results if result.method == claim.better and result.pair in pairs]
     return Verdict(
         claim=claim.text,
         environment=environment,
-        comparison=f"{left} ({claim.metric}) against {right} ({against}), {protocol}",
-        seeds=seeds,
+        comparison=f"{left} ({claim.metric}) against {right} ({against})",
+        protocol=protocol,
+        pairs=pairs,
         differences=differences,
         mean=fmean(differences) if differences else None,
         low=low,
         high=high,
-        verdict=_verdict(low, high),
+        probability=sign_probability(differences),
+        adjusted=None,
+        covers=coverage(used),
+        verdict=UNDECIDED,
     )
 
 
-def measure_result(result: RunResult, metric: Metric, protocol: str) -> float | None:
+def measure(result: RunResult, metric: Metric, protocol: str | None) -> float | None:
     """Value of a metric that a result contains; `curve` is the mean over the points of the learning curve.
 
     `curve` measures sample efficiency; it always uses the first protocol of the experiment.
     """
     if metric == "curve":
         return sum(point.final for point in result.curve) / len(result.curve) if result.curve else None
+    value: float | None
     if metric in ("training_seconds", "peak_memory"):
-        value: float | None = getattr(result, metric)
+        value = getattr(result, metric)
         return value
-    evaluation = result.evaluations.get(protocol, {})
+    if metric in WITHOUT_PROTOCOL:
+        value = None if result.contexts is None else getattr(result.contexts, metric)
+        return value
+    evaluation = result.evaluations.get(protocol or "", {})
     return evaluation.get(f"mean_{metric}")
 
 
-def _by_seed(
-    runs: Sequence[FinishedRun], method: str, metric: Metric, protocol: str, measure: Measure
-) -> dict[int, float]:
-    values = {run.result.seed: measure(run, metric, protocol) for run in runs if run.result.method == method}
-    return {seed: value for seed, value in values.items() if value is not None}
+def _protocols(claim: Claim, protocols: tuple[str, ...]) -> tuple[str | None, ...]:
+    if {claim.metric, claim.against or claim.metric} <= WITHOUT_PROTOCOL:
+        return (None,)
+    return claim.protocols or protocols
 
 
-def _verdict(low: float | None, high: float | None) -> str:
-    if low is not None and low > 0:
-        return SUPPORTED
-    return CONTRADICTED if high is not None and high < 0 else UNDECIDED
+def _by_pair(
+    results: Sequence[RunResult], method: str, metric: Metric, protocol: str | None
+) -> dict[tuple[int, int | None], float]:
+    values = {result.pair: measure(result, metric, protocol) for result in results if result.method == method}
+    return {pair: value for pair, value in values.items() if value is not None}
+
+
+def _decided(found: Verdict) -> Verdict:
+    if found.adjusted is None or found.mean is None or found.adjusted >= 1 - CONFIDENCE:
+        return found
+    return replace(found, verdict=SUPPORTED if found.mean > 0 else CONTRADICTED)

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from tcmrl_algo.context_methods.attention import attention_of
 from tcmrl_algo.context_methods.learner import ContextAlgorithm
+from tcmrl_algo.experiment.results import ContextMeasures
 from tcmrl_algo.reporting.sources import FinishedRun
 from tcmrl_algo.training.checkpoint import open_run
 from tcmrl_algo.training.train import create_algorithm
@@ -110,9 +111,16 @@ class TrainedContexts:
         ]
         return _transition_weights(rows, self._stored)
 
-    def distance_ratio(self) -> float | None:
-        """Mean distance of contexts of one task over that of contexts of two tasks; None without contexts."""
-        return None if self.contexts is None else distance_ratio(self.contexts, self.labels)
+    def measures(self) -> ContextMeasures:
+        """The numbers that a report keeps of the run's contexts and attention."""
+        attention = {}
+        for kind in ("zero", "nonzero") if self.weights is not None else ():
+            weights = getattr(self.weights, kind)
+            if len(weights):
+                attention[f"attention_{kind}"] = float(weights.mean())
+                attention[f"median_{kind}"] = float(np.median(weights))
+        ratio = None if self.contexts is None else distance_ratio(self.contexts, self.labels)
+        return ContextMeasures(tasks=len(self._stored.tasks), context_ratio=ratio, **attention)
 
 
 def distance_ratio(contexts: FloatArray, labels: IntArray) -> float | None:

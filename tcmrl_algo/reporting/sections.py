@@ -5,13 +5,10 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
-from tcmrl_algo.experiment.results import RunResult, by_method
+from tcmrl_algo.experiment.results import RunResult, by_method, coverage
 from tcmrl_algo.reporting.claims import Verdict
-from tcmrl_algo.reporting.contexts import TransitionWeights
+from tcmrl_algo.reporting.returns import DatasetReturns
 from tcmrl_algo.reporting.tables import Cell, Table, across_seeds, interval_text
-from tcmrl_data import Dataset, return_table
 
 PAPER_COSTS = ("paper: training s", "paper: MB")
 PAPER_ATTENTION = ("paper: mean", "paper: median")
@@ -25,30 +22,31 @@ def final_table(name: str, results: Sequence[RunResult]) -> Table:
         for method, runs in by_method(results).items():
             values = {part: [run.evaluations[protocol][f"mean_{part}"] for run in runs] for part in PARTS}
             others = (across_seeds(values[part])[0] for part in PARTS[1:])
-            rows.append((protocol, method, len(runs), *across_seeds(values["final"]), *others))
-    columns = ("protocol", "method", "seeds", "return", "IQM", "95% interval", "other context")
-    return Table(name, (*columns, "regret", "normalized"), tuple(rows))
+            row = (protocol, method, len(runs), *across_seeds(values["final"]), *others)
+            rows.append((*row, coverage(runs)))
+    columns = ("protocol", "method", "runs", "return", "IQM", "95% interval", "other context")
+    return Table(name, (*columns, "regret", "normalized", "interval covers"), tuple(rows))
 
 
 def curve_table(name: str, results: Sequence[RunResult]) -> Table:
     """Points of the learning curves, one row per run and step."""
     rows = tuple(
-        (run.label, run.seed, point.step, point.final, point.regret, point.shuffled)
+        (run.label, run.seed, run.fold, point.step, point.final, point.regret, point.shuffled)
         for run in results
         for point in run.curve
     )
-    return Table(name, ("method", "seed", "step", "return", "regret", "other context"), rows)
+    return Table(name, ("method", "seed", "fold", "step", "return", "regret", "other context"), rows)
 
 
 def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
-    """Claims with the mean difference, its interval or the seeds' differences, and the verdict."""
+    """Claims with the mean difference, its interval or the runs' differences, p values, and the verdict."""
     rows: list[tuple[Cell, ...]] = []
     for found in verdicts:
-        interval = interval_text(found.differences, found.low, found.high) if found.seeds else None
-        numbers = (len(found.seeds), found.mean, interval)
-        rows.append((found.claim, found.environment, found.comparison, *numbers, found.verdict))
-    columns = ("claim", "environment", "compared", "seeds", "mean difference", "95% interval", "verdict")
-    return Table(name, columns, tuple(rows))
+        interval = interval_text(found.differences, found.low, found.high) if found.pairs else None
+        what = (found.claim, found.environment, found.comparison, found.protocol)
+        rows.append((*what, found.mean, interval, found.adjusted, found.verdict, found.covers))
+    columns = ("claim", "environment", "compared", "protocol", "mean difference", "95% interval")
+    return Table(name, (*columns, "p, corrected", "verdict", "interval covers"), tuple(rows))
 
 
 def claims_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Table:
@@ -95,42 +93,39 @@ def cost_table(name: str, environment: str, results: Sequence[RunResult]) -> Tab
     return Table(name, (*columns, *(PAPER_COSTS if costs else ())), tuple(rows))
 
 
-def context_table(name: str, ratios: Sequence[tuple[str, Sequence[float | None]]]) -> Table:
+def context_table(name: str, results: Sequence[RunResult]) -> Table:
     """Mean distance of contexts of one task over that of contexts of two tasks, by method."""
-    rows = tuple((method, len(values), *across_seeds(values)[::2]) for method, values in ratios)
-    return Table(name, ("method", "seeds", "within / between tasks", "95% interval"), rows)
+    rows: list[tuple[Cell, ...]] = []
+    for method, runs in by_method(results).items():
+        ratios = [run.contexts.context_ratio for run in runs if run.contexts is not None]
+        rows.append((method, len(ratios), *across_seeds(ratios)[::2]))
+    return Table(name, ("method", "runs", "within / between tasks", "95% interval"), tuple(rows))
 
 
-def attention_table(
-    name: str, environment: str, weights: Sequence[tuple[str, Sequence[TransitionWeights]]]
-) -> Table | None:
+def attention_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
     """Relative weights of transitions with and without reward, with those of the paper's Table 5.
 
-    None if no trajectory contains both kinds.
+    None if no trajectory contains both kinds, or no method has attention.
     """
     printed = published()["attention"].get(environment, {})
     rows: list[tuple[Cell, ...]] = []
     for kind in ("nonzero", "zero"):
-        for method, runs in weights:
-            found = [getattr(run_weights, kind) for run_weights in runs]
-            if any(len(values) == 0 for values in found):
-                continue
-            mean, _, interval = across_seeds([float(values.mean()) for values in found])
-            median = across_seeds([float(np.median(values)) for values in found])[0]
-            rows.append((method, f"{kind} reward", mean, interval, median, *printed.get(kind, ())))
+        for method, runs in by_method(results).items():
+            measured = [run.contexts for run in runs if run.contexts is not None]
+            mean, _, interval = across_seeds([getattr(found, f"attention_{kind}") for found in measured])
+            median = across_seeds([getattr(found, f"median_{kind}") for found in measured])[0]
+            if mean is not None:
+                rows.append((method, f"{kind} reward", mean, interval, median, *printed.get(kind, ())))
     columns = ("method", "transitions", "mean", "95% interval", "median")
     return Table(name, (*columns, *(PAPER_ATTENTION if printed else ())), tuple(rows)) if rows else None
 
 
-def dataset_table(name: str, dataset: Dataset) -> Table:
+def dataset_table(name: str, returns: DatasetReturns) -> Table:
     """Mean returns of the stored episodes over tasks, by snapshot (the paper's Table 8 is unknown to us)."""
-    tasks = return_table(dataset)["tasks"]
-    steps = sorted({found["step"] for task in tasks for found in task["snapshots"]})
-    rows: list[tuple[Cell, ...]] = []
-    for step in (*steps, None):
-        cells = [_mean_return(tasks, split, step) for split in ("train", "test")]
-        rows.append(("all" if step is None else step, *cells))
-    return Table(name, ("snapshot", "training tasks", "test tasks"), tuple(rows))
+    rows = tuple(
+        ("all" if found.step is None else found.step, found.train, found.test) for found in returns.snapshots
+    )
+    return Table(name, ("snapshot", "training tasks", "test tasks"), rows)
 
 
 def setup_table(name: str, results: Sequence[RunResult]) -> Table:
@@ -139,6 +134,7 @@ def setup_table(name: str, results: Sequence[RunResult]) -> Table:
         "dataset root": [result.root for result in results],
         "training profile": [result.profile for result in results],
         "seeds": [result.seed for result in results],
+        "folds": [result.fold for result in results if result.fold is not None] or ["the dataset's split"],
         "training steps": [result.steps for result in results],
         "device": [result.device for result in results],
         "threads per run": [result.threads for result in results],
@@ -152,25 +148,14 @@ def setup_table(name: str, results: Sequence[RunResult]) -> Table:
 
 def digest_table(name: str, results: Sequence[RunResult]) -> Table:
     """Digests of the runs' tensors, for comparison with a repetition."""
-    rows = tuple((result.label, result.seed, result.digest) for result in results)
-    return Table(name, ("method", "seed", "sha256 of all tensors"), rows)
+    rows = tuple((result.label, result.seed, result.fold, result.digest) for result in results)
+    return Table(name, ("method", "seed", "fold", "sha256 of all tensors"), rows)
 
 
 def published() -> dict[str, Any]:
     """Numbers of the paper that reports print beside ours."""
     file = importlib.resources.files("tcmrl_manifests") / "published.toml"
     return tomllib.loads(file.read_text(encoding="utf-8"))
-
-
-def _mean_return(tasks: Sequence[dict[str, Any]], split: str, step: int | None) -> float | None:
-    means = [
-        found["mean"]
-        for task in tasks
-        if task["split"] == split
-        for found in task["snapshots"]
-        if step in (None, found["step"])
-    ]
-    return float(np.mean(means)) if means else None
 
 
 def _plus_minus(score: Sequence[float] | None) -> str | None:

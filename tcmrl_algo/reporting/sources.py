@@ -1,16 +1,19 @@
 """Inputs of a report: results folders of experiments, and single runs."""
 
 import itertools
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from tcmrl_algo.adaptation.evaluate import evaluate_run
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.experiment.config import Experiment, read_experiment, run_id
-from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file
+from tcmrl_algo.experiment.results import AGAIN, RunResult, error_file, read_results, result_file
+from tcmrl_algo.reporting.returns import DatasetReturns
 from tcmrl_algo.training.checkpoint import Run, open_run, tensors_digest
 from tcmrl_data import CheckpointError, TrainingError, canonical_json, open_dataset, parse_json
+from tcmrl_data.foundation.records import read_record
 
 
 @dataclass(frozen=True)
@@ -28,17 +31,31 @@ class FinishedRun:
 
 @dataclass(frozen=True)
 class Source:
-    """An experiment and its finished runs, ordered by environment, method and seed.
+    """An experiment and its finished runs, ordered by environment, method, fold and seed.
 
     Attributes:
         experiment: the experiment.
         runs: its finished runs.
-        missing: its other runs, with the error of those that failed.
+        unfinished: ids of its other runs, with the error of those that failed.
+        datasets: returns of the datasets, by environment, as far as an earlier report measured them.
     """
 
     experiment: Experiment
     runs: tuple[FinishedRun, ...]
-    missing: tuple[str, ...] = ()
+    unfinished: Mapping[str, str | None] = field(default_factory=dict)
+    datasets: Mapping[str, DatasetReturns] = field(default_factory=dict)
+
+    @property
+    def failed(self) -> dict[str, str]:
+        """Errors of the runs that failed, by id."""
+        return {name: error for name, error in self.unfinished.items() if error is not None}
+
+    @property
+    def missing(self) -> list[str]:
+        """The unfinished runs as text, with their errors."""
+        return [
+            f"`{name}`{'' if error is None else f' ({error})'}" for name, error in self.unfinished.items()
+        ]
 
     def environments(self) -> list[str]:
         """Environments with finished runs."""
@@ -48,6 +65,10 @@ class Source:
         """Finished runs in an environment."""
         return [run for run in self.runs if run.result.environment == environment]
 
+    def results(self, environment: str) -> list[RunResult]:
+        """Results of the finished runs in an environment."""
+        return [run.result for run in self.of(environment)]
+
 
 def read_sources(
     paths: Sequence[Path], report: Callable[[str, int, int], None], *, datasets: Sequence[Path] = ()
@@ -55,7 +76,7 @@ def read_sources(
     """Reads results folders in the given order; then all run folders as one source, evaluating the runs.
 
     Args:
-        paths: the folders.
+        paths: the folders; of a folder of results folders, all in it by name.
         report: called when run folders are evaluated.
         datasets: folders of datasets that were moved after the training of the runs.
 
@@ -65,10 +86,13 @@ def read_sources(
     places = {open_dataset(folder).manifest.root: str(folder.resolve()) for folder in datasets}
     sources, runs = [], []
     for path in paths:
+        inner = sorted(path.glob("*/experiment.json"), key=lambda file: natural_order(file.parent.name))
         if (path / "experiment.json").is_file():
             sources.append(_results_folder(path, places))
         elif (path / "run.json").is_file():
             runs.append(open_run(path))
+        elif inner:
+            sources += [_results_folder(file.parent, places) for file in inner]
         else:
             raise CheckpointError(
                 f"{path} contains neither experiment.json nor run.json; name a folder of "
@@ -85,8 +109,15 @@ def read_sources(
     return sources
 
 
+def natural_order(name: str) -> list[tuple[str, int]]:
+    """Sorts `figure10` after `figure5`."""
+    return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name)]
+
+
 def _relocated(result: RunResult, places: Mapping[str, str]) -> RunResult:
-    """A result with the present folder of its dataset."""
+    """A result with the present folder of its dataset; views of folds have the root of their source."""
+    if result.fold is not None:
+        return result
     return result.model_copy(update={"dataset": places.get(result.root, result.dataset)})
 
 
@@ -101,26 +132,30 @@ def _results_folder(path: Path, places: Mapping[str, str]) -> Source:
     experiment = read_experiment(tables, place=str(file))
     found = [
         FinishedRun(
-            _relocated(result, places), path / "runs" / run_id(result.environment, result.method, result.seed)
+            _relocated(result, places),
+            path / "runs" / run_id(result.environment, result.method, result.seed, result.fold),
         )
         for result in read_results(path, experiment)
     ]
     if not found:
         raise CheckpointError(f"{path} contains no finished run; continue with `tcmrl experiment`")
-    return Source(experiment, tuple(found), _missing(path, experiment))
+    records = [
+        read_record(DatasetReturns, file, remedy=AGAIN) for file in sorted(path.glob("datasets/*.json"))
+    ]
+    datasets = {record.environment: record for record in records}
+    return Source(experiment, tuple(found), _unfinished(path, experiment), datasets)
 
 
-def _missing(path: Path, experiment: Experiment) -> tuple[str, ...]:
-    found = []
-    for environment, method, seed in itertools.product(
-        experiment.environments, experiment.methods, experiment.seeds
+def _unfinished(path: Path, experiment: Experiment) -> dict[str, str | None]:
+    found: dict[str, str | None] = {}
+    for environment, method, seed, fold in itertools.product(
+        experiment.environments, experiment.methods, experiment.seeds, experiment.fold_numbers
     ):
-        name = run_id(environment, method, seed)
+        name = run_id(environment, method, seed, fold)
         if not result_file(path / "runs" / name).is_file():
             error = error_file(path / "runs" / name)
-            reason = f" ({error.read_text(encoding='utf-8').strip()})" if error.is_file() else ""
-            found.append(f"`{name}`{reason}")
-    return tuple(found)
+            found[name] = error.read_text(encoding="utf-8").strip() if error.is_file() else None
+    return found
 
 
 def _single_runs(

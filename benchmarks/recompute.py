@@ -1,0 +1,59 @@
+"""Recomputes what the documentation says of results, from the committed documents of the single runs.
+
+`python benchmarks/recompute.py` rewrites every report below docs/results and every marked number and table
+of the pages; with `--check` it changes nothing, names what differs, and ends with exit code 1 if anything
+does. No dataset and no checkpoint is needed. `tcmrl_algo/reporting/pages.py` explains the marks.
+"""
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from tcmrl_algo.reporting.compose import compose
+from tcmrl_algo.reporting.pages import Pages, unmarked_numbers
+from tcmrl_algo.reporting.write import measure_paths, page_text
+
+ROOT = Path(__file__).parents[1]
+RECOMPUTED = ("docs/results/learning.md",)
+"""Pages in whose prose every decimal number has a mark."""
+
+
+def main() -> None:
+    """Rewrites or checks."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--check", action="store_true", help="change nothing")
+    arguments = parser.parse_args()
+    problems = list(unmarked(ROOT))
+    for file, text in recomputed(ROOT):
+        if file.read_text(encoding="utf-8") != text:
+            if arguments.check:
+                problems.append(f"{file.relative_to(ROOT)} differs from its results")
+            else:
+                file.write_text(text, encoding="utf-8")
+                print(f"{file.relative_to(ROOT)}: rewritten")
+    print("\n".join(problems))
+    sys.exit(1 if problems else 0)
+
+
+def unmarked(root: Path) -> Iterator[str]:
+    """Decimal numbers that have no mark, in pages that may have none."""
+    for name in RECOMPUTED:
+        for number in unmarked_numbers((root / name).read_text(encoding="utf-8")):
+            yield f"{name}: {number} has no mark"
+
+
+def recomputed(root: Path) -> Iterator[tuple[Path, str]]:
+    """Every file of the documentation that is made of results, with what they give."""
+    results = root / "docs/results"
+    for report in sorted(results.glob("*/report.md")):
+        page, _ = compose(measure_paths([report.parent]), report.parent)
+        yield report, page_text(page)
+        yield from ((report.parent / f"{table.name}.csv", table.csv()) for table in page.tables)
+    pages = Pages(results)
+    for file in [root / "README.md", *sorted(root.glob("docs/*.md")), *sorted(results.glob("*.md"))]:
+        yield file, pages.rewritten(file.read_text(encoding="utf-8"))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,161 @@
+"""Pages whose numbers are recomputed from committed results.
+
+A page marks what was measured. The marks are comments, which Markdown does not show:
+
+    -4.67<!-- = figure4_point_robot; point-robot; idaq; TCMRL; final -->
+
+is one number, with as many decimals as stand there, and
+
+    <!-- returns figure4_point_robot -->
+    <!-- end -->
+
+is a whole table. Folders are those of reports below one root, such as `docs/results`. The keys of a number
+are folder, environment, protocol, method and a quantity (`final`, `shuffled`, `regret`, `normalized`, and
+`low` or `high`, the ends of the 95% interval of `final`); or folder, environment, protocol, `claim N` and one
+of `mean`, `low`, `high`, `p` (N counts the claims of the experiment from 1); or a JSON file and the keys into
+it, and last, if needed, a factor such as `* 1000`.
+"""
+
+import re
+from collections.abc import Callable, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any, final
+
+from tcmrl_algo.experiment.aggregate import summarize
+from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.reporting import sections
+from tcmrl_algo.reporting.claims import Verdict, judge
+from tcmrl_algo.reporting.sources import Source, read_sources
+from tcmrl_data import TrainingError, parse_json
+
+NUMBER = re.compile(r"(?P<shown>[-−+]?\d[\d,]*(?:\.\d+)?)<!-- = (?P<key>[^>]*?) -->")
+BLOCK = re.compile(r"<!-- (?P<kind>\w+) (?P<folder>\S+) -->\n(?P<shown>.*?)<!-- end -->", re.DOTALL)
+UNMARKED = re.compile(r"(?<![\w.])[-−+]?\d[\d,]*\.\d+(?![\w.]*\d)")
+NOT_PROSE = re.compile(r"```.*?```|`[^`\n]*`|\]\([^)]*\)|<!--.*?-->", re.DOTALL)
+FACTOR = "* "
+
+
+@final
+class Pages:
+    """Rewrites pages; every report is read once.
+
+    Args:
+        root: folder of the reports.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self._root = root
+        self.source = cache(self._read_source)
+        self.document = cache(self._read_document)
+
+    def rewritten(self, text: str) -> str:
+        """A page with every marked number and table as the results give them.
+
+        Raises:
+            TcmrlError: a mark names no result; the message quotes the mark.
+        """
+        blocks = BLOCK.sub(lambda match: _block(match, self), text)
+        return NUMBER.sub(lambda match: _number(match, self), blocks)
+
+    def _read_source(self, folder: str) -> Source:
+        (source,) = read_sources([self._root / folder], lambda stage, done, total: None)
+        return source
+
+    def _read_document(self, file: str) -> Any:
+        return parse_json((self._root / file).read_bytes())
+
+
+def unmarked_numbers(text: str) -> list[str]:
+    """Decimal numbers in the prose and tables of a page that no mark recomputes.
+
+    Code, link targets and recomputed tables do not count, nor does a number without decimals.
+    """
+    prose = NUMBER.sub("", BLOCK.sub("", text))
+    return UNMARKED.findall(NOT_PROSE.sub("", prose))
+
+
+def _block(match: "re.Match[str]", pages: Pages) -> str:
+    kind, folder = match["kind"], match["folder"]
+    if kind not in BLOCKS:
+        raise TrainingError(f"{match[0].splitlines()[0]}: no such table; there are {', '.join(BLOCKS)}")
+    return f"<!-- {kind} {folder} -->\n{BLOCKS[kind](pages.source(folder))}\n<!-- end -->"
+
+
+def _returns(source: Source) -> str:
+    parts = []
+    for environment in source.environments():
+        table = sections.final_table("returns", source.results(environment))
+        parts.append(f"On {environment}:\n\n{table.markdown()}")
+    return "\n" + "\n\n".join(parts) + "\n"
+
+
+def _claims(source: Source) -> str:
+    return f"\n{sections.verdict_table('claims', judge(source)).markdown()}\n"
+
+
+BLOCKS: dict[str, Callable[[Source], str]] = {"returns": _returns, "claims": _claims}
+"""What a table mark may ask for."""
+
+
+def _number(match: "re.Match[str]", pages: Pages) -> str:
+    keys = [key.strip() for key in match["key"].split(";")]
+    try:
+        value = _value(keys, pages)
+    except (LookupError, ValueError, TypeError, OSError) as error:
+        raise TrainingError(
+            f"{match[0]}: names no number ({error}); see `tcmrl_algo.reporting.pages`"
+        ) from None
+    shown = match["shown"]
+    decimals = len(shown.partition(".")[2])
+    sign = "+" if shown.startswith("+") and value >= 0 else ""
+    text = f"{sign}{value:{',' if ',' in shown else ''}.{decimals}f}"
+    return f"{text.replace('-', '−') if '−' in shown else text}<!-- = {match['key']} -->"
+
+
+def _value(keys: Sequence[str], pages: Pages) -> float:
+    folder, *rest = keys
+    if folder.endswith(".json"):
+        return _of_json(pages.document(folder), rest)
+    environment, protocol, subject, quantity = rest
+    source = pages.source(folder)
+    if subject.startswith("claim "):
+        claim = source.experiment.claims[int(subject.removeprefix("claim ")) - 1]
+        (verdict,) = (
+            found
+            for found in judge(source)
+            if (found.claim, found.environment) == (claim.text, environment)
+            and found.protocol in (None, protocol)
+        )
+        return _of_verdict(verdict, quantity)
+    runs = [result for result in source.results(environment) if result.method == subject]
+    if not runs:
+        raise LookupError(f"no run of {subject!r} on {environment!r}")
+    return _of_runs(runs, protocol, quantity)
+
+
+def _of_verdict(verdict: Verdict, quantity: str) -> float:
+    values = {"mean": verdict.mean, "low": verdict.low, "high": verdict.high, "p": verdict.adjusted}
+    value = values[quantity]
+    if value is None:
+        raise ValueError(f"the verdict has no {quantity}")
+    return value
+
+
+def _of_runs(runs: Sequence[RunResult], protocol: str, quantity: str) -> float:
+    ends = quantity in ("low", "high")
+    name = "mean_final" if ends else f"mean_{quantity}"
+    summary = summarize([run.evaluations[protocol][name] for run in runs])
+    value: float | None = getattr(summary, quantity) if ends else summary.mean
+    if value is None:
+        raise ValueError(f"fewer than five runs have no {quantity}")
+    return value
+
+
+def _of_json(value: Any, keys: Sequence[str]) -> float:
+    factor = 1.0
+    if keys and keys[-1].startswith(FACTOR):
+        factor, keys = float(keys[-1].removeprefix(FACTOR)), keys[:-1]
+    for key in keys:
+        value = value[int(key)] if isinstance(value, list) else value[key]
+    return float(value) * factor
