@@ -169,6 +169,13 @@ class Experiment(_Table):
         }
         return self.model_copy(update=changes)
 
+    def without_places(self) -> "Experiment":
+        """The same experiment without the folders of its datasets, which results name by their roots."""
+        environments = {
+            name: choice.model_copy(update={"dataset": None}) for name, choice in self.environments.items()
+        }
+        return self.model_copy(update={"environments": environments})
+
     def to_json(self) -> dict[str, Any]:
         """What `read_experiment` takes back."""
         return self.model_dump(mode="json", by_alias=True)
@@ -217,8 +224,8 @@ def experiment_names() -> list[str]:
 
 
 def folder_name(text: str) -> str:
-    """A label as part of a file name: `TCMRL w/o TCE` becomes `tcmrl-w-o-tce`."""
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
+    """A label as part of a file name: `TCMRL w/o TCE` becomes `tcmrl-w-o-tce`, `A++` `a-plus-plus`."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower().replace("+", "-plus")).strip("-")
 
 
 def run_id(environment: str, method: str, seed: int, fold: int | None = None) -> str:

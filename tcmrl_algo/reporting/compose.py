@@ -30,6 +30,10 @@ is judged under every protocol that it concerns. The 95% interval of the mean di
 for this comparison alone. `p, corrected` is the p value of the same test after Holm's correction for all \
 verdicts of the experiment: below 0.05 a claim is supported or contradicted, by the sign of the mean. With \
 fewer than five runs there is no interval and no verdict."""
+ADAPTATION = """\
+Returns of the adaptation episodes of a protocol in turn, means over test tasks and runs. The first episodes \
+of `paper` act uniformly, those of the other protocols by stored or tried contexts; where the first stage is \
+random, the protocol was run several times (`repeats` in the JSON documents), and all returns are means."""
 BESIDE = """\
 The paper has other data, another split of tasks, other training and its own protocol: the columns have \
 the same unit, but are not comparable otherwise."""
@@ -135,6 +139,16 @@ def _add_environment(page: Page, name: str, environment: str, found: Measured) -
     )
     if any(len(result.curve) > 1 for result in results):
         _add_curves(page, name, environment, results)
+    adaptation = sections.adaptation_table(f"{name}-adaptation", results)
+    if adaptation is not None:
+        page.text("#### Episodes until adapted")
+        page.text(ADAPTATION)
+        page.figure(
+            f"{name}-adaptation",
+            "returns of adaptation episodes",
+            lambda file: figures.draw_adaptation(file, environment, results),
+        )
+        page.data(adaptation)
     published = sections.published_table(f"{name}-paper", environment, results)
     if published is not None:
         page.text("#### Numbers of the paper")

@@ -57,6 +57,20 @@ def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
     figure.savefig(file, dpi=130)
 
 
+def draw_adaptation(file: Path, title: str, results: Sequence[RunResult]) -> None:
+    """Return of the first, second, … adaptation episode, means over tasks and runs; a panel per protocol."""
+    protocols = list(results[0].evaluations)
+    figure, panels = _panels(len(protocols))
+    for axes, protocol in zip(panels, protocols, strict=True):
+        for index, (method, runs) in enumerate(by_method(results).items()):
+            curves = [run.evaluations[protocol].get("adaptation_curve", []) for run in runs]
+            means = [float(np.mean(values)) for values in zip(*curves, strict=False)]
+            axes.plot(range(1, len(means) + 1), means, ".-", color=f"C{index % 10}", label=method)
+        axes.set(xlabel="episode", ylabel="return on test tasks", title=f"{title}: {protocol}")
+        axes.legend(fontsize="small")
+    figure.savefig(file, dpi=130)
+
+
 def draw_embeddings(
     file: Path,
     points: Mapping[str, FloatArray],

@@ -38,6 +38,17 @@ def curve_table(name: str, results: Sequence[RunResult]) -> Table:
     return Table(name, ("method", "seed", "fold", "step", "return", "regret", "other context"), rows)
 
 
+def adaptation_table(name: str, results: Sequence[RunResult]) -> Table | None:
+    """Returns of the adaptation episodes in turn, a row per run, protocol and episode; None without any."""
+    rows = tuple(
+        (protocol, run.label, run.seed, run.fold, episode, value)
+        for run in results
+        for protocol, evaluation in run.evaluations.items()
+        for episode, value in enumerate(evaluation.get("adaptation_curve", []), start=1)
+    )
+    return Table(name, ("protocol", "method", "seed", "fold", "episode", "return"), rows) if rows else None
+
+
 def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     """Claims with the mean difference, its interval or the runs' differences, p values, and the verdict."""
     rows: list[tuple[Cell, ...]] = []

@@ -113,7 +113,7 @@ def _write_records(folder: Path, found: Measured) -> list[Path]:
     """Writes a results folder with compact results; the files."""
     make_folders(folder)
     source, files = found.source, [folder / "experiment.json"]
-    write_record(files[0], source.experiment)
+    write_record(files[0], source.experiment.without_places())
     for run in source.runs:
         result = run.result
         name = run_id(result.environment, result.method, result.seed, result.fold)
