@@ -6,13 +6,24 @@ does. No dataset and no checkpoint is needed. `tcmrl_algo/reporting/pages.py` ex
 """
 
 import argparse
+import contextlib
+import io
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import TYPE_CHECKING
 
+from tcmrl_cli.evaluation import score_tables
+from tcmrl_cli.experiments import result_tables
+from tcmrl_cli.frame import print_table
+
+from tcmrl_algo import Evaluation, TaskResult
 from tcmrl_algo.reporting.compose import compose
 from tcmrl_algo.reporting.pages import Pages, unmarked_numbers
 from tcmrl_algo.reporting.write import measure_paths, page_text
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 ROOT = Path(__file__).parents[1]
 RECOMPUTED = ("docs/results/learning.md",)
@@ -50,9 +61,35 @@ def recomputed(root: Path) -> Iterator[tuple[Path, str]]:
         page, _ = compose(measure_paths([report.parent]), report.parent)
         yield report, page_text(page)
         yield from ((report.parent / f"{table.name}.csv", table.csv()) for table in page.tables)
-    pages = Pages(results)
+    pages = Pages(results, {"evaluation": evaluation, "shown": shown})
     for file in [root / "README.md", *sorted(root.glob("docs/*.md")), *sorted(results.glob("*.md"))]:
         yield file, pages.rewritten(file.read_text(encoding="utf-8"))
+
+
+def evaluation(pages: Pages, file: str) -> str:
+    """What `tcmrl evaluate --protocol all` prints of its JSON documents: the first two tables."""
+    found = [
+        Evaluation(**(document | {"tasks": [TaskResult(**task) for task in document["tasks"]]}))
+        for document in pages.document(file)
+    ]
+    run = f"results/{Path(file).parent}/runs/point-robot--tcmrl--seed{found[0].seed}"
+    return _console(f"$ tcmrl evaluate {run} --protocol all", *score_tables(found)[:2])
+
+
+def shown(pages: Pages, folder: str) -> str:
+    """What `tcmrl experiment` prints of finished runs."""
+    source = pages.source(folder)
+    (environment,) = source.environments()
+    command = f"$ tcmrl experiment {source.experiment.name} --data data/demo"
+    return _console(command, *result_tables(environment, source.results(environment)))
+
+
+def _console(command: str, *tables: "Table") -> str:
+    output = io.StringIO()
+    with contextlib.redirect_stdout(output):
+        for table in tables:
+            print_table(table)
+    return f"```\n{command}\n{output.getvalue().rstrip()}\n```"
 
 
 if __name__ == "__main__":

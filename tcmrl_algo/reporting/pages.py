@@ -17,7 +17,7 @@ it, and last, if needed, a factor such as `* 1000`.
 """
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any, final
@@ -42,10 +42,12 @@ class Pages:
 
     Args:
         root: folder of the reports.
+        blocks: more kinds of tables; what each makes of a folder or file below the root.
     """
 
-    def __init__(self, root: Path) -> None:
+    def __init__(self, root: Path, blocks: "Mapping[str, Block] | None" = None) -> None:
         self._root = root
+        self._blocks = {**BLOCKS, **(blocks or {})}
         self.source = cache(self._read_source)
         self.document = cache(self._read_document)
 
@@ -55,15 +57,26 @@ class Pages:
         Raises:
             TcmrlError: a mark names no result; the message quotes the mark.
         """
-        blocks = BLOCK.sub(lambda match: _block(match, self), text)
+        blocks = BLOCK.sub(self._block, text)
         return NUMBER.sub(lambda match: _number(match, self), blocks)
+
+    def _block(self, match: "re.Match[str]") -> str:
+        kind, folder = match["kind"], match["folder"]
+        if kind not in self._blocks:
+            known = ", ".join(self._blocks)
+            raise TrainingError(f"{match[0].splitlines()[0]}: no such table; there are {known}")
+        return f"<!-- {kind} {folder} -->\n{self._blocks[kind](self, folder)}\n<!-- end -->"
 
     def _read_source(self, folder: str) -> Source:
         (source,) = read_sources([self._root / folder], lambda stage, done, total: None)
         return source
 
     def _read_document(self, file: str) -> Any:
-        return parse_json((self._root / file).read_bytes())
+        data = (self._root / file).read_bytes()
+        try:
+            return parse_json(data)
+        except ValueError:  # a document per line
+            return [parse_json(line) for line in data.splitlines()]
 
 
 def unmarked_numbers(text: str) -> list[str]:
@@ -75,26 +88,20 @@ def unmarked_numbers(text: str) -> list[str]:
     return UNMARKED.findall(NOT_PROSE.sub("", prose))
 
 
-def _block(match: "re.Match[str]", pages: Pages) -> str:
-    kind, folder = match["kind"], match["folder"]
-    if kind not in BLOCKS:
-        raise TrainingError(f"{match[0].splitlines()[0]}: no such table; there are {', '.join(BLOCKS)}")
-    return f"<!-- {kind} {folder} -->\n{BLOCKS[kind](pages.source(folder))}\n<!-- end -->"
-
-
-def _returns(source: Source) -> str:
-    parts = []
+def _returns(pages: Pages, folder: str) -> str:
+    parts, source = [], pages.source(folder)
     for environment in source.environments():
         table = sections.final_table("returns", source.results(environment))
         parts.append(f"On {environment}:\n\n{table.markdown()}")
     return "\n" + "\n\n".join(parts) + "\n"
 
 
-def _claims(source: Source) -> str:
-    return f"\n{sections.verdict_table('claims', judge(source)).markdown()}\n"
+def _claims(pages: Pages, folder: str) -> str:
+    return f"\n{sections.verdict_table('claims', judge(pages.source(folder))).markdown()}\n"
 
 
-BLOCKS: dict[str, Callable[[Source], str]] = {"returns": _returns, "claims": _claims}
+Block = Callable[[Pages, str], str]
+BLOCKS: dict[str, Block] = {"returns": _returns, "claims": _claims}
 """What a table mark may ask for."""
 
 
