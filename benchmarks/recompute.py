@@ -7,11 +7,12 @@ does. No dataset and no checkpoint is needed. `tcmrl_algo/reporting/pages.py` ex
 
 import argparse
 import contextlib
+import dataclasses
 import io
 import sys
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from tcmrl_cli.evaluation import score_tables
 from tcmrl_cli.experiments import result_tables
@@ -25,6 +26,7 @@ from tcmrl_algo.reporting.write import measure_paths, page_text
 if TYPE_CHECKING:
     from rich.table import Table
 
+Kind = TypeVar("Kind", Evaluation, TaskResult)
 ROOT = Path(__file__).parents[1]
 RECOMPUTED = ("docs/results/learning.md",)
 """Pages in whose prose every decimal number has a mark."""
@@ -69,7 +71,7 @@ def recomputed(root: Path) -> Iterator[tuple[Path, str]]:
 def evaluation(pages: Pages, file: str) -> str:
     """What `tcmrl evaluate --protocol all` prints of its JSON documents: the first two tables."""
     found = [
-        Evaluation(**(document | {"tasks": [TaskResult(**task) for task in document["tasks"]]}))
+        _record(Evaluation, document | {"tasks": [_record(TaskResult, task) for task in document["tasks"]]})
         for document in pages.document(file)
     ]
     run = f"results/{Path(file).parent}/runs/point-robot--tcmrl--seed{found[0].seed}"
@@ -82,6 +84,11 @@ def shown(pages: Pages, folder: str) -> str:
     (environment,) = source.environments()
     command = f"$ tcmrl experiment {source.experiment.name} --data data/demo"
     return _console(command, *result_tables(environment, source.results(environment)))
+
+
+def _record(kind: type[Kind], values: dict[str, Any]) -> Kind:
+    """A dataclass of a document that may be older than some of its fields."""
+    return kind(**{field.name: values.get(field.name) for field in dataclasses.fields(kind)})  # type: ignore[arg-type]
 
 
 def _console(command: str, *tables: "Table") -> str:

@@ -190,7 +190,7 @@ def test_only_and_seeds_choose_runs_and_the_table_keeps_the_rest(
         ({"seeds": [0, 0]}, ["seeds", "distinct"]),
         ({"seeds": []}, ["seeds"]),
         ({"protocols": ["ofline"], "claims": []}, ["protocols", "'ofline'; did you mean offline"]),
-        ({"claims": [CLAIM | {"protocol": "idaq"}]}, ["'idaq' is not evaluated", "offline, paper"]),
+        ({"claims": [CLAIM | {"protocols": ["idaq"]}]}, ["'idaq' is not evaluated", "offline, paper"]),
         ({"name": "../up"}, ["name"]),
         ({"schema": 2}, ["schema"]),
         ({"curve_points": 41}, ["41", "40"]),
