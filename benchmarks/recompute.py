@@ -69,13 +69,13 @@ def recomputed(root: Path) -> Iterator[tuple[Path, str]]:
 
 
 def evaluation(pages: Pages, file: str) -> str:
-    """What `tcmrl evaluate --protocol all` prints of its JSON documents: the first two tables."""
+    """What `tcmrl evaluate --protocol all` prints of its JSON documents: the first three tables."""
     found = [
         _record(Evaluation, document | {"tasks": [_record(TaskResult, task) for task in document["tasks"]]})
         for document in pages.document(file)
     ]
     run = f"results/{Path(file).parent}/runs/point-robot--tcmrl--seed{found[0].seed}"
-    return _console(f"$ tcmrl evaluate {run} --protocol all", *score_tables(found)[:2])
+    return _console(f"$ tcmrl evaluate {run} --protocol all", *score_tables(found)[:3])
 
 
 def shown(pages: Pages, folder: str) -> str:
