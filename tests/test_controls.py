@@ -69,6 +69,20 @@ def test_the_fixed_snapshot_is_the_training_tasks_last_policy_that_does_best_the
     assert task.fixed_snapshot == pytest.approx(expected, abs=1e-4)
 
 
+def test_of_many_candidates_only_the_best_few_are_tried_in_all_tasks(
+    tiny: Dataset, found: Controls, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tcmrl_algo.adaptation.control_bench.SCREENING_TASKS", 3)
+    monkeypatch.setattr("tcmrl_algo.adaptation.control_bench.FINALISTS", 3)
+    bench = ControlBench(tiny, lambda stage, done, total: None)
+    screened, _ = bench.fixed_snapshot()
+    bench.close()
+    assert screened is not None and found.fixed_snapshot is not None
+    assert len(screened.train_returns) == 3
+    expected = {task: found.fixed_snapshot.train_returns[task] for task in screened.train_returns}
+    assert screened.train_returns == pytest.approx(expected, abs=1e-4)  # means over all training tasks
+
+
 def test_behavior_is_the_best_of_the_test_tasks_own_policies_without_noise(
     tiny: Dataset, found: Controls
 ) -> None:

@@ -20,6 +20,9 @@ from tcmrl_data import Controller, Dataset, Purpose, Task
 TEST_EPISODES = 5
 """Episodes per policy and test task; one per policy and training task choose the fixed policies."""
 
+SCREENING_TASKS, FINALISTS = 10, 5
+"""Training tasks in which all candidates for a fixed policy are tried, and candidates tried in all tasks."""
+
 Control = Callable[[Sequence[Task]], Controller]
 """How a policy acts in lanes of some tasks."""
 
@@ -44,7 +47,10 @@ class ControlBench:
         )
         self._hidden = hidden_entries(dataset.environment)
         self._done = 0
-        candidates = len(dataset.train_tasks) * len(dataset.train_tasks)
+        tasks = len(dataset.train_tasks)
+        candidates = tasks * min(SCREENING_TASKS, tasks) + (
+            FINALISTS * tasks if tasks > SCREENING_TASKS else 0
+        )
         own = sum(len(dataset.parts.keys_of(task.index)) for task in dataset.test_tasks)
         self._total = candidates + (own + len(dataset.test_tasks)) * TEST_EPISODES
 
@@ -67,24 +73,32 @@ class ControlBench:
     def fixed_snapshot(
         self,
     ) -> tuple[FixedSnapshot | None, Control | None]:
-        """The best of the training tasks' last policies, and how it acts in any task."""
-        training, means, best = self.dataset.train_tasks, dict[int, float](), None
-        for task in training:
-            for key in self.dataset.select(tasks=[task.index], snapshots="last").parts[task.index]:
-                control = self._policy(task, key.step, key.run)
-                if control is None:
-                    continue
-                mean = fmean(self.returns(training, control, 1))
-                means[task.index] = max(mean, means.get(task.index, -np.inf))
-                if best is None or mean > best[0]:
-                    best = (mean, key, control)
-        if best is None:
+        """The best of the training tasks' last policies, and how it acts in any task.
+
+        With more than SCREENING_TASKS training tasks, the FINALISTS that do best in evenly spaced ones of
+        them are compared in all.
+        """
+        training = self.dataset.train_tasks
+        chosen = np.linspace(0, len(training) - 1, min(SCREENING_TASKS, len(training))).round().astype(int)
+        found = {
+            key: control
+            for task in training
+            for key in self.dataset.select(tasks=[task.index], snapshots="last").parts[task.index]
+            if (control := self._policy(task, key.step, key.run)) is not None
+        }
+        if not found:
             return None, None
-        mean, key, control = best
+        screening = [training[place] for place in chosen]
+        means = {key: fmean(self.returns(screening, control, 1)) for key, control in found.items()}
+        if len(training) > SCREENING_TASKS:
+            finalists = sorted(means, key=means.__getitem__)[-FINALISTS:]
+            means = {key: fmean(self.returns(training, found[key], 1)) for key in finalists}
+        best = max(means, key=means.__getitem__)
+        returns = {key.task: means[key] for key in sorted(means, key=means.__getitem__)}
         record = FixedSnapshot(
-            task=key.task, step=key.step, run=key.run, train_return=mean, train_returns=means
+            task=best.task, step=best.step, run=best.run, train_return=means[best], train_returns=returns
         )
-        return record, control
+        return record, found[best]
 
     def fixed_target(self) -> FixedTarget | None:
         """The best target of the oracle; None without an oracle."""

@@ -16,7 +16,7 @@ class FixedSnapshot(_Record):
     Attributes:
         task, step, run: the part that holds the policy.
         train_return: mean over the training tasks.
-        train_returns: mean of every candidate, by training task.
+        train_returns: mean of every candidate that was tried in all of them, by the candidate's task.
     """
 
     task: int
