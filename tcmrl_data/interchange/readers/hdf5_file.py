@@ -2,10 +2,12 @@
 
 Links of any kind but hard ones, external and virtual storage, user-defined filters, and types without a fixed
 size are refused before they are followed. Compressed chunks are unpacked here first, up to the size that
-their dataset declares: the library would unpack whatever they hold.
+their dataset declares: the library would unpack whatever they hold. Heaps of texts are walked here first: an
+entry of no size would keep the library walking for ever.
 """
 
 import contextlib
+import io
 import os
 import zlib
 from collections.abc import Iterator, Sequence
@@ -24,6 +26,12 @@ from tcmrl_data.store.limits import MAX_INDEX
 
 MOST_MEMBERS = 2**20
 LARGEST_ATTRIBUTE = 2**20
+LARGEST_HEAP = 2 * LARGEST_ATTRIBUTE
+HEAP, HEAP_HEADER, HEAP_ENTRY = b"GCOL", 16, 16
+"""A heap is HEAP, 4 bytes, and its size in 8; then entries of an index in 2 bytes, 6 bytes, and a size in 8,
+with that many bytes behind them, up to a multiple of 8. The entry of index 0 is the free rest with its header
+(HDF5 File Format Specification, III.E)."""
+
 NUMBERS = "biuf"
 """Kinds of the types that are read: truth values, integers, floats."""
 
@@ -57,9 +65,16 @@ class Hdf5File:
     def __init__(self, path: Path) -> None:
         self.path = path
         self._left = self._limit = decoded_limit(require_file(path).stat().st_size)
-        with self._named(""):
-            self._file = h5py.File(path, "r", locking=False, rdcc_nbytes=2**20)
-        self._raw = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+        self._checked = _CheckedFile(path)
+        self._raw = self._checked.fileno()
+        try:
+            with self._named(""):
+                self._file = h5py.File(self._checked, "r", locking=False, rdcc_nbytes=2**20)
+                if self._file.id.get_create_plist().get_sizes() != (8, 8):
+                    raise ValueError("its addresses and sizes do not have 8 bytes")
+        except BaseException:
+            self._checked.close()
+            raise
 
     def __enter__(self) -> Self:
         return self
@@ -67,9 +82,9 @@ class Hdf5File:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        os.close(self._raw)
         with contextlib.suppress(*_ERRORS):
             self._file.close()
+        self._checked.close()
 
     def members(self, group: str) -> list[str]:
         """Names in a group, sorted."""
@@ -221,6 +236,32 @@ class Hdf5File:
             if not member:
                 raise StoreError(f"{self.path} does not open as HDF5 ({reason})") from None
             raise StoreError(f"{self.path}: {printable(member)[:200]} {reason}") from None
+
+
+class _CheckedFile(io.FileIO):
+    """A file as the library reads it, block by block; refuses a heap that cannot be walked to its end."""
+
+    def readinto(self, buffer: Any, /) -> int:
+        offset = self.tell()
+        count = super().readinto(buffer) or 0
+        if bytes(memoryview(buffer)[: len(HEAP)]) == HEAP:
+            self._check_heap(offset)
+        return count
+
+    def _check_heap(self, offset: int) -> None:
+        header = os.pread(self.fileno(), HEAP_HEADER, offset)
+        size = int.from_bytes(header[8:], "little")
+        if size > LARGEST_HEAP:
+            raise OSError(f"has a heap of {size} bytes, more than {LARGEST_HEAP}")
+        heap = os.pread(self.fileno(), size, offset)
+        place = HEAP_HEADER
+        while place + HEAP_ENTRY <= len(heap):
+            index = int.from_bytes(heap[place : place + 2], "little")
+            entry = int.from_bytes(heap[place + 8 : place + HEAP_ENTRY], "little")
+            entry = HEAP_ENTRY + -(-entry // 8) * 8 if index else entry
+            if entry < HEAP_ENTRY or place + entry > len(heap):
+                raise OSError(f"has a damaged heap: the entry {place} bytes behind its start does not fit")
+            place += entry
 
 
 def _filters(dataset: h5py.Dataset) -> list[int]:
