@@ -1,6 +1,7 @@
-"""Random chains of derive, merge and split over small datasets."""
+"""Random chains of derive, merge, split and extend over small datasets."""
 
 import shutil
+from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import pytest
@@ -12,24 +13,42 @@ from tcmrl_data import (
     Dataset,
     Transitions,
     derive_dataset,
+    diff_datasets,
+    extend_dataset,
     merge_datasets,
     open_dataset,
     open_sampler,
     split_dataset,
     verify_dataset,
 )
-from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.curation.publishing import publish_parts
+from tcmrl_data.curation.remaking import RemakeSpec
+from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit
+from tcmrl_data.foundation.errors import BuildError, SelectionError, TcmrlError
 from tests.graded import graded_dataset
 
-STEPS = st.lists(
-    st.tuples(
-        st.sampled_from(["tier", "view", "cut", "tasks", "merge", "fold", "folded view", "episodes"]),
-        st.integers(0, 10),
-        st.integers(0, 10),
-    ),
-    min_size=1,
-    max_size=4,
-)
+OPERATIONS = ["tier", "view", "cut", "tasks", "merge", "fold", "folded view", "episodes"]
+
+
+def chains_of(operations: list[str]) -> st.SearchStrategy[list[tuple[str, int, int]]]:
+    """Operations, and which datasets they take."""
+    numbers = st.integers(0, 10)
+    return st.lists(st.tuples(st.sampled_from(operations), numbers, numbers), min_size=1, max_size=4)
+
+
+class InThisProcess(BaseEngine):
+    """Makes parts without the seconds that it takes to start a process."""
+
+    def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
+        for unit in units:
+            try:
+                digest = publish_parts(
+                    RemakeSpec.from_json(unit.spec),
+                    lambda message: on_message(unit.id, message),  # noqa: B023
+                )
+                yield Result(unit.id, True, digest, None, 1, "here")
+            except TcmrlError as error:
+                yield Result(unit.id, False, None, str(error), 1, "here")
 
 
 @pytest.fixture(scope="module")
@@ -37,6 +56,15 @@ def seeds(tmp_path_factory: pytest.TempPathFactory) -> list[Dataset]:
     folder = tmp_path_factory.mktemp("seeds")
     scores = {0: 0.0, 100: 40.0, 200: 90.0}
     return [graded_dataset(folder / f"{seed}", seed=seed, scores=scores, tasks=range(5)) for seed in range(2)]
+
+
+@pytest.fixture(scope="module")
+def policies(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> list[Dataset]:
+    """Datasets with policies: some tasks of the tiny one, and others of it."""
+    folder = tmp_path_factory.mktemp("policies")
+    for name, tasks in (("left", [0, 3, 40, 99]), ("right", [3, 60, 99])):
+        derive_dataset(tiny, folder / name, tasks=tasks, snapshots="steps>=100")
+    return [open_dataset(folder / name) for name in ("left", "right")]
 
 
 def apply(step: tuple[str, int, int], held: list[Dataset], folder: Path) -> Dataset | None:
@@ -50,6 +78,10 @@ def apply(step: tuple[str, int, int], held: list[Dataset], folder: Path) -> Data
             merge_datasets([other, source], folder / "other order")
             assert open_dataset(folder / "other order").manifest.digest == open_dataset(out).manifest.digest
             shutil.rmtree(folder / "other order")
+        elif operation == "extend":
+            run = f"extended{second % 3}"
+            tasks = [task.index for task in source.tasks][second % 2 :]
+            extend_dataset(source.path, out=out, episodes=3, run=run, tasks=tasks, noise=0.1 * (second % 3))
         elif operation in ("fold", "folded view"):
             made = split_dataset(source, out, folds=2, seed=second, views=operation == "folded view")
             return open_dataset(made[first % 2].out)
@@ -64,18 +96,14 @@ def apply(step: tuple[str, int, int], held: list[Dataset], folder: Path) -> Data
                 "tasks": {"tasks": [task.index for task in source.tasks][second % 2 :]},
             }
             derive_dataset(source, out, **choices[operation])  # type: ignore[arg-type]
-    except SelectionError:
+    except (SelectionError, BuildError):
         assert not (out / "manifest.json").exists()
         return None
     return open_dataset(out)
 
 
-@settings(max_examples=25)
-@given(steps=STEPS)
-def test_chains_keep_parts_and_splits(
-    seeds: list[Dataset], tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, int]]
-) -> None:
-    folder, held = tmp_path_factory.mktemp("chain"), list(seeds)
+def check_chain(held: list[Dataset], folder: Path, steps: list[tuple[str, int, int]]) -> None:
+    """Takes the steps and checks what must hold of every dataset that they make."""
     for step in steps:
         made = apply(step, held, folder)
         held += [made] if made is not None else []
@@ -86,6 +114,7 @@ def test_chains_keep_parts_and_splits(
             assert contents.setdefault(dataset.entry(key).id, data) == data
         if dataset.path.is_dir():
             assert verify_dataset(dataset.path, level="deep").findings == ()
+        assert diff_datasets(dataset, dataset).is_empty
         training = {task.index for task in dataset.train_tasks}
         tested = {task.index for task in dataset.test_tasks}
         assert not training & tested
@@ -99,6 +128,26 @@ def test_chains_keep_parts_and_splits(
             assert rows <= _rows(dataset, training)
             assert not rows & _rows(dataset, tested)
     shutil.rmtree(folder)
+
+
+@settings(max_examples=25)
+@given(steps=chains_of(OPERATIONS))
+def test_chains_keep_parts_and_splits(
+    seeds: list[Dataset], tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, int]]
+) -> None:
+    check_chain(list(seeds), tmp_path_factory.mktemp("chain"), steps)
+
+
+@pytest.mark.sweep
+@settings(max_examples=6)
+@given(steps=chains_of(["extend", "extend", *OPERATIONS]))
+def test_chains_with_extensions_keep_parts_and_splits(
+    policies: list[Dataset], tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, int]]
+) -> None:
+    """Extended parts are made again by every deep verification."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(ENGINES, "get", lambda name: InThisProcess)
+        check_chain(list(policies), tmp_path_factory.mktemp("chain"), steps)
 
 
 def _rows(dataset: Dataset, tasks: set[int]) -> set[bytes]:

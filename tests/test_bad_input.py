@@ -1,0 +1,155 @@
+"""Bad input for every command of the manager: exit code 2, one line that names it, and nothing written."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from tcmrl_cli.data import data
+
+from tcmrl_data import derive_dataset, import_dataset, merge_datasets, rename_dataset, split_dataset
+from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.interchange.formats.hdf5 import Hdf5Format
+from tests.commands import assert_refused, in_process
+from tests.graded import graded_dataset
+
+SCORES = {0: 0.0, 100: 40.0, 200: 90.0}
+
+CASES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "derive, unknown tier": ("derive {data} --tier best --out {new}", ("'best'", "medium-replay")),
+    "derive, unknown rule": ("derive {data} --snapshots tier:best --out {new}", ("best", "medium")),
+    "derive, no reference scores": (
+        "derive {imported} --tier medium --out {new}",
+        ("{imported}", "no return of uniform actions is known"),
+    ),
+    "derive, no such task": ("derive {data} --tasks 7 --out {new}", ("no task 7",)),
+    "derive, output exists": ("derive {data} --out {used}", ("{used}", "exists")),
+    "derive, view exists": ("derive {data} --view {file}", ("{file}", "exists")),
+    "derive, no dataset": ("derive {folder} --out {new}", ("{folder}",)),
+    "merge, tasks disagree": (
+        "merge {data} {moved} --out {new}",
+        ("task 0: goal", "[9.0, 9.0]", "{data}", "{moved}"),
+    ),
+    "merge, output exists": ("merge {data} {other} --out {used}", ("{used}", "exists")),
+    "merge, one dataset": ("merge {data} --out {new}", ("two datasets",)),
+    "merge, no dataset": ("merge {data} {folder} --out {new}", ("{folder}",)),
+    "split, too many folds": ("split {data} --folds 9 --out {new}", ("9 folds",)),
+    "split, output exists": (
+        "split {data} --episodes 2,2 --names used,x --out {folder}",
+        ("{used}", "exists"),
+    ),
+    "split, view exists": (
+        "split {data} --folds 2 --views --names file,x --out {folder}",
+        ("{file}", "exists"),
+    ),
+    "split, too many episodes": ("split {data} --episodes 40,5 --out {new}", ("has 4 episodes",)),
+    "rename, no label": ("rename {data} {empty}", ("expected 1 to 200",)),
+    "rename, no dataset": ("rename {folder} label", ("{folder}",)),
+    "delete, no dataset": ("delete {folder} --yes", ("{folder}", "no dataset")),
+    "diff, no dataset": ("diff {data} {folder}", ("{folder}",)),
+    "diff, unknown level": ("diff {data} {other} --level deep", ("'deep'",)),
+    "extend, unknown tier": ("extend {data} --episodes 4 --snapshots tier:best", ("best", "medium")),
+    "extend, no reference scores": (
+        "extend {imported} --episodes 4 --snapshots tier:medium",
+        ("{imported}",),
+    ),
+    "extend, no policies": ("extend {data} --episodes 4 --out {new}", ("no policy",)),
+    "extend, no seeds": ("extend {imported} --episodes 4 --out {new}", ("imported", "not known")),
+    "extend, no such task": ("extend {data} --episodes 4 --tasks 7", ("no task 7",)),
+    "extend, no dataset": ("extend {folder} --episodes 4", ("{folder}",)),
+    "relabel, unknown tier": ("relabel {data} --to 1 --snapshots tier:best --out {new}", ("best", "medium")),
+    "relabel, unknown targets": ("relabel {data} --to nearest --out {new}", ("nearest:K",)),
+    "relabel, no seeds": ("relabel {imported} --to 0 --out {new}", ("imported", "not known")),
+    "relabel, another platform": (
+        "relabel {data} --to 1 --out {new}",
+        ("{data}", "was made on another platform"),
+    ),
+    "relabel, a test task": ("relabel {data} --to 3 --out {new}", ("task 3 is a test task",)),
+    "import, unknown format": ("import hdf6 {exported} --out {new}", ("'hdf6'", "hdf5")),
+    "import, output exists": ("import hdf5 {exported} --out {used}", ("{used}", "exists")),
+    "import, no file": ("import hdf5 {folder}/no.hdf5 --out {new}", ("no.hdf5",)),
+    "import, another environment": (
+        "import hdf5 {exported} --environment half-cheetah-vel --out {new}",
+        ("2 columns of observations", "half-cheetah-vel"),
+    ),
+    "export, unknown format": ("export {data} --format hdf6 --out {new}", ("'hdf6'", "hdf5")),
+    "export, unknown tier": (
+        "export {data} --format hdf5 --snapshots tier:best --out {new}",
+        ("best", "medium"),
+    ),
+    "export, no reference scores": (
+        "export {imported} --format hdf5 --snapshots tier:medium --out {new}",
+        ("{imported}", "no return of uniform actions is known"),
+    ),
+    "export, output exists": ("export {data} --format hdf5 --out {used}", ("{used}",)),
+    "export, no dataset": ("export {folder} --format hdf5 --out {new}", ("{folder}",)),
+}
+
+
+@pytest.fixture(scope="module")
+def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
+    """Names in the cases, and what they stand for."""
+    folder = tmp_path_factory.mktemp("places")
+    made = {
+        "data": graded_dataset(folder / "data", scores=SCORES).folder,
+        "other": graded_dataset(folder / "other", scores=SCORES, seed=1).folder,
+        "moved": graded_dataset(folder / "moved", scores=SCORES, moved=True).folder,
+    }
+    exported, *_ = Hdf5Format().export(graded_dataset(folder / "z", scores=SCORES), folder / "hdf5")
+    import_dataset("hdf5", [exported], folder / "imported")
+    things = folder / "things"
+    (things / "used").mkdir(parents=True)
+    (things / "used" / "notes.txt").write_text("mine")
+    (things / "file.json").write_text("{}")
+    more = {
+        "imported": folder / "imported",
+        "exported": exported,
+        "folder": things,
+        "used": things / "used",
+        "file": things / "file.json",
+        "new": folder / "new",
+    }
+    return {name: str(path) for name, path in (made | more).items()} | {"empty": ""}
+
+
+def contents(folder: Path) -> dict[str, bytes | None]:
+    """All files and folders with their bytes."""
+    return {str(path): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_bad_input_is_refused_in_a_line(
+    case: str, places: dict[str, str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    command, expected = CASES[case]
+    root = Path(places["data"]).parent
+    before = contents(root)
+    arguments = [word.format(**places) for word in command.split()]
+    result = in_process(data, capsys)(*arguments, "--quiet")
+    assert_refused(result, *(text.format(**places) for text in expected))
+    assert contents(root) == before
+
+
+Command = Callable[[Path, Path, Callable[[int, int], None]], object]
+CHANGED: dict[str, Command] = {
+    "derive": lambda source, out, progress: derive_dataset(source, out, progress=progress),
+    "cut": lambda source, out, progress: derive_dataset(source, out, episodes=2, progress=progress),
+    "merge": lambda source, out, progress: merge_datasets(
+        [source, source.with_name("other")], out, progress=progress
+    ),
+    "split": lambda source, out, progress: split_dataset(source, out, folds=2, progress=progress),
+}
+
+
+@pytest.mark.parametrize("command", CHANGED)
+def test_a_source_that_changes_meanwhile_is_noticed(command: str, tmp_path: Path) -> None:
+    for seed, name in enumerate(("data", "other")):
+        graded_dataset(tmp_path / name, scores={0: 0.0, 100: 50.0}, tasks=range(4), seed=seed)
+    source, out = tmp_path / "data", tmp_path / "out"
+
+    def change(done: int, total: int) -> None:
+        if done == 1:
+            rename_dataset(source, "renamed meanwhile")
+
+    with pytest.raises(StoreError, match=r"data has changed meanwhile"):
+        CHANGED[command](source, out, change)
+    assert not list(out.rglob("manifest.json"))
