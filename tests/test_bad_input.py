@@ -6,9 +6,15 @@ from pathlib import Path
 import pytest
 from tcmrl_cli.data import data
 
-from tcmrl_data import derive_dataset, import_dataset, merge_datasets, rename_dataset, split_dataset
+from tcmrl_data import (
+    derive_dataset,
+    export_dataset,
+    import_dataset,
+    merge_datasets,
+    rename_dataset,
+    split_dataset,
+)
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.formats.hdf5 import Hdf5Format
 from tests.commands import assert_refused, in_process
 from tests.graded import graded_dataset
 
@@ -94,7 +100,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
         "other": graded_dataset(folder / "other", scores=SCORES, seed=1).folder,
         "moved": graded_dataset(folder / "moved", scores=SCORES, moved=True).folder,
     }
-    exported, *_ = Hdf5Format().export(graded_dataset(folder / "z", scores=SCORES), folder / "hdf5")
+    exported, *_ = export_dataset(graded_dataset(folder / "z", scores=SCORES), "hdf5", folder / "hdf5").files
     import_dataset("hdf5", [exported], folder / "imported")
     things = folder / "things"
     (things / "used").mkdir(parents=True)

@@ -96,6 +96,10 @@ def apply(step: tuple[str, int, int], held: list[Dataset], folder: Path) -> Data
                 "tasks": {"tasks": [task.index for task in source.tasks][second % 2 :]},
             }
             derive_dataset(source, out, **choices[operation])  # type: ignore[arg-type]
+            found, made = diff_datasets(source, out), open_dataset(out)
+            assert set(found.left_only) == {*source.parts} - {*made.parts}
+            assert {*found.different} == {key for key in made.parts if made.entry(key) != source.entry(key)}
+            assert found.right_only == ()
     except (SelectionError, BuildError):
         assert not (out / "manifest.json").exists()
         return None
