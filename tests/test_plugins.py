@@ -176,9 +176,10 @@ ENVIRONMENT_GROUP = "tcmrl.environments"
 
 @pytest.fixture
 def pole_recipe() -> str:
-    """The recipe of point-robot, for another environment."""
+    """The recipe of point-robot, for another environment, whose tasks have no order."""
     file = ENVIRONMENTS.get("point-robot").recipe_file("point-robot")
-    return file.read_text(encoding="utf-8").replace('name = "point-robot"', 'name = "pole"')
+    text = file.read_text(encoding="utf-8").replace('name = "point-robot"', 'name = "pole"')
+    return text.replace('split = "strata"', 'split = "permutation"')
 
 
 @pytest.fixture
