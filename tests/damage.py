@@ -2,7 +2,8 @@
 
 from pathlib import Path
 
-from tcmrl_data import open_dataset
+from tcmrl_data import open_dataset, verify_dataset
+from tcmrl_data.build.events import EVENTS
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING
 from tcmrl_data.store.keys import PartKey
 
@@ -29,3 +30,15 @@ def littered(folder: Path) -> set[str]:
         (folder / CHECKPOINTS / name).mkdir(parents=True)
         (folder / CHECKPOINTS / name / "state").write_bytes(b"1234567")
     return {f"{STAGING}/task_00003.dead", f"{STAGING}/manifest.json.0123", f"{CHECKPOINTS}/task_00003"}
+
+
+def data_files(folder: Path) -> list[Path]:
+    return sorted(
+        path
+        for path in folder.rglob("*")
+        if path.is_file() and not path.relative_to(folder).parts[0].startswith((".", EVENTS))
+    )
+
+
+def found(folder: Path) -> set[str]:
+    return {finding.file for finding in verify_dataset(folder).findings}

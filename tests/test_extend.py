@@ -203,14 +203,17 @@ def test_a_killed_extension_goes_on(tiny_copy: CopyTiny) -> None:
     assert verify_dataset(folder).findings == ()
 
 
-def test_repair_says_which_parts_it_does_not_make(tiny_copy: CopyTiny) -> None:
+def test_repair_makes_extended_parts_and_their_sources_again(tiny_copy: CopyTiny) -> None:
     folder = tiny_copy()
-    extend_dataset(folder, episodes=3, tasks=[0], workers=1)
-    damaged = folder / "parts/extended/00000/0000150.zip"
-    damaged.write_bytes(damaged.read_bytes()[:-1])
-    report = tcmrl_data.repair_dataset(folder)
-    assert report.failed == ("1 parts of run extended were not built here; restore them from a copy",)
-    assert report.repaired == ()
+    extend_dataset(folder, episodes=3, tasks=[0], noise=0.1, workers=1)
+    dataset = open_dataset(folder)
+    damaged = [PartKey(0, 150, "extended"), PartKey(0, 150)]
+    for key in damaged:
+        dataset.file_of(key).write_bytes(dataset.file_of(key).read_bytes()[:-1])
+    report = tcmrl_data.repair_dataset(folder, workers=1)
+    assert (report.failed, report.left) == ((), ())
+    assert report.repaired == tuple(sorted(damaged))
+    assert open_dataset(folder).manifest.root == dataset.manifest.root
 
 
 def test_command_line(tiny_copy: CopyTiny, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -25,8 +25,8 @@ from tcmrl_data.store.keys import PARTS, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import TASKS
-from tcmrl_data.verification import repair as repair_module
-from tests.damage import ids_of, rot
+from tcmrl_data.verification import making_again
+from tests.damage import data_files, found, ids_of, rot
 
 Copy = Callable[[], Path]
 
@@ -155,12 +155,12 @@ def test_a_part_that_comes_out_differently_replaces_nothing(
     folder = tiny_copy()
     for step in (0, 100, 150):
         (folder / part_file(PartKey(3, step))).unlink()
-    build = repair_module.build_dataset
+    build = making_again.build_dataset
 
     def build_with_another_seed(*arguments: object, **options: object) -> object:
         return build(*arguments, **(options | {"seed": 1}))  # type: ignore[arg-type]
 
-    monkeypatch.setattr(repair_module, "build_dataset", build_with_another_seed)
+    monkeypatch.setattr(making_again, "build_dataset", build_with_another_seed)
     before = {path: path.read_bytes() for path in data_files(folder)}
     with pytest.raises(NondeterminismError, match="task 3, step 0, run main came out as"):
         repair_dataset(folder, workers=1)

@@ -25,7 +25,7 @@ from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.tables import read_lines
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import replay as replay_module
-from tests.damage import rot
+from tests.damage import data_files, found, rot
 from tests.forged_datasets import PART, STEP, Forge, base
 
 Copy = Callable[[], Path]
@@ -41,18 +41,6 @@ def sound(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def forge(tiny_folder: Path, tmp_path: Path) -> Forge:
     (tmp_path / "outside").mkdir()
     return Forge(base(tiny_folder, tmp_path / "data"), tmp_path / "outside")
-
-
-def data_files(folder: Path) -> list[Path]:
-    return sorted(
-        path
-        for path in folder.rglob("*")
-        if path.is_file() and not path.relative_to(folder).parts[0].startswith((".", EVENTS))
-    )
-
-
-def found(folder: Path) -> set[str]:
-    return {finding.file for finding in verify_dataset(folder).findings}
 
 
 def flip(data: bytes, chance: random.Random) -> bytes:

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.build import build_dataset
 from tcmrl_data.build.events import BuildEvent
 from tcmrl_data.build.published import Published, numbered, read_published
 from tcmrl_data.build.work_files import check_work_files
@@ -15,20 +14,19 @@ from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
     lock_file,
-    make_folders,
     move_into_place,
     remove_abandoned,
     remove_tree,
     replace_file,
 )
 from tcmrl_data.foundation.errors import NondeterminismError, ReadOnlyError
-from tcmrl_data.foundation.plain_files import folder_problem, read_plain_file
-from tcmrl_data.store.archive import LARGEST_ARCHIVE
+from tcmrl_data.foundation.plain_files import folder_problem
 from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.manifest import Run, dataset_folder, read_manifest
+from tcmrl_data.store.manifest import dataset_folder, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification.findings import Finding, VerifyLevel
+from tcmrl_data.verification.making_again import build_again, extend_again, lasting_damage, made_file
 from tcmrl_data.verification.tables import restore_tables, write_tables
 from tcmrl_data.verification.verify import find_problems, verify_dataset
 
@@ -63,11 +61,12 @@ def repair_dataset(
     workers: int | None = None,
     progress: Callable[[BuildEvent], None] = lambda event: None,
 ) -> RepairReport:
-    """Rebuilds the parts that verification rejects, and only these, with the manifest's recipe and seed.
+    """Makes the parts that verification rejects again, and only these, with the manifest's recipes and seeds.
 
-    New parts replace old ones only when all are made and have the ids of the table; until then the dataset is
-    not touched. Damaged tables are written again from the parts, if these have the manifest's root. Foreign
-    files stay and are named.
+    Built parts are built, extended ones made from the policies of other parts. New parts replace old ones
+    only when all of their kind are made and have the ids of the table; until then the dataset is not touched.
+    Damaged tables are written again from the parts, if these have the manifest's root. Foreign files stay
+    and are named.
 
     Args:
         path: the dataset's folder or its `manifest.json`.
@@ -121,26 +120,41 @@ def _repair(
 def _replace_parts(
     folder: Path, keys: Sequence[PartKey], workers: int | None, progress: Callable[[BuildEvent], None]
 ) -> tuple[str, ...]:
-    """Makes parts again and puts them in their places; returns one line per failure, if nothing was replaced.
+    """Makes parts again and puts them in their places: built ones first, then what was made from them.
+
+    Returns:
+        One line per failure; the parts of that kind of run, and of later kinds, are then as they were.
 
     Raises:
-        NondeterminismError: a part came out with another id; nothing was replaced.
+        NondeterminismError: a part came out with another id; no part of that kind of run was replaced.
     """
-    dataset = Dataset(folder, read_manifest(folder))
-    made: dict[PartKey, Path] = {}
-    unknown = {key.run for key in keys} - {run.name for run in dataset.manifest.runs}
-    if unknown:
-        return (f"{folder}: the manifest has no run {min(unknown)}; restore it from a copy",)
-    for run in dataset.manifest.runs:
-        chosen = [key for key in keys if key.run == run.name]
-        if chosen and (run.recipe is None or run.seed is None or run.kind != "built"):
-            return (f"{len(chosen)} parts of run {run.name} were not built here; restore them from a copy",)
-        if chosen:
+    runs = {run.name: run for run in read_manifest(folder).runs}
+    for key in keys:
+        problem = lasting_damage(runs.get(key.run), key)
+        if problem:
+            return (f"{folder}: {problem}; restore it from a copy",)
+    for kind in ("built", "extended"):
+        dataset = Dataset(folder, read_manifest(folder))
+        made: dict[PartKey, Path] = {}
+        for run in runs.values():
+            chosen = [key for key in keys if key.run == run.name and run.kind == kind]
+            if not chosen:
+                continue
             target = folder / STAGING / REPAIR / run.name
-            failed = _make_again(dataset, run, chosen, target, workers, progress)
+            if kind == "built":
+                failed = build_again(dataset, run, chosen, target, workers, progress)
+            else:
+                failed = extend_again(dataset, run, chosen, target, workers)
             if failed:
                 return failed
-            made |= {key: target / part_file(PartKey(key.task, key.step)) for key in chosen}
+            made |= {key: made_file(target, run, key) for key in chosen}
+        _put_in_place(dataset, made)
+    return ()
+
+
+def _put_in_place(dataset: Dataset, made: dict[PartKey, Path]) -> None:
+    """Replaces parts by new ones, if all have the ids of the table."""
+    folder = dataset.folder
     published = [read_published(file, key.run)[0] for key, file in made.items()]
     for part in published:
         recorded = dataset.recorded_parts.entry(part.entry.key)
@@ -154,48 +168,6 @@ def _replace_parts(
         _clear(folder, part_file(key))
         replace_file(folder / part_file(key), file.read_bytes(), staging=folder / STAGING)
     _record(dataset, published)
-    return ()
-
-
-def _make_again(
-    dataset: Dataset,
-    run: Run,
-    keys: Sequence[PartKey],
-    target: Path,
-    workers: int | None,
-    progress: Callable[[BuildEvent], None],
-) -> tuple[str, ...]:
-    """Builds the affected tasks of a run in a folder, where their sound parts lie; their groups train along.
-
-    Returns:
-        One line per failure.
-    """
-    assert run.recipe is not None
-    assert run.seed is not None
-    tasks = {key.task for key in keys}
-    group_size = run.recipe.make_source().group_size
-    groups = {task // group_size for task in tasks}
-    recorded = dataset.recorded_tasks
-    others = [
-        task.index for task in recorded if task.index // group_size in groups and task.index not in tasks
-    ]
-    make_folders(target)
-    for task in sorted(tasks):
-        for key in dataset.recorded_parts.keys_of(task):
-            if key.run == run.name and key not in keys:
-                copy = target / part_file(PartKey(key.task, key.step))
-                data = read_plain_file(dataset.file_of(key), limit=LARGEST_ARCHIVE)
-                replace_file(copy, data, staging=target / STAGING)
-    report = build_dataset(
-        run.recipe,
-        target,
-        seed=run.seed,
-        tasks=sorted(tasks),
-        dropped=others,
-        workers=workers,
-        progress=progress,
-    )
-    return report.failed
 
 
 def _record(dataset: Dataset, parts: Sequence[Published]) -> None:
