@@ -295,7 +295,7 @@ def test_a_protocol_of_another_package_evaluates_beside_ours(trained: Path, call
     code, output, errors = call("evaluate", trained, "--protocol", "all", "--json")
     assert code == 0
     assert [document["protocol"] for document in json.loads(output)] == sorted(
-        ["borrowed", "idaq", "idaq_literal", "offline", "paper"]
+        ["borrowed", "idaq", "idaq_literal", "non_prior", "offline", "paper"]
     )
     assert "left out: protocol 'torn' of package 'foreign' is broken: ModuleNotFoundError" in errors
     assert_refused(call("evaluate", trained, "--protocol", "torn"), "'torn'", "no_such_module")

@@ -60,13 +60,8 @@ def test_tasks_are_the_same_bits_on_every_instruction_set(platform: str) -> None
     assert_equal_elsewhere(NAMES, OTHER_PLATFORMS[platform])
 
 
-@pytest.mark.parametrize(
-    "platform",
-    [
-        pytest.param(name, marks=pytest.mark.exhaustive if position else pytest.mark.sweep)
-        for position, name in enumerate(OTHER_PLATFORMS)
-    ],
-)
+@pytest.mark.exhaustive
+@pytest.mark.parametrize("platform", OTHER_PLATFORMS)
 def test_all_tasks_are_the_same_bits_on_every_instruction_set(platform: str) -> None:
     assert_equal_elsewhere(ALL_NAMES, OTHER_PLATFORMS[platform])
 
