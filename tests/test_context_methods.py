@@ -51,6 +51,10 @@ def test_packed_trajectories_carry_what_lies_between_a_step_and_their_end() -> N
     assert discounts.tolist() == [0.25, 0.5, 0.0]
     assert times.tolist() == [0, 1, 0]
     np.testing.assert_array_equal(final, [short.observations[2], short.observations[2], np.zeros(3)])
+    ended = replace(short, terminated=np.array([False, True]))
+    packed = pad_trajectories([[ended], [short]], problem(), gamma=0.5)
+    assert packed.discounts_to_end is not None
+    assert packed.discounts_to_end.tolist() == [[[0.0, 0.0]], [[0.25, 0.5]]]
 
 
 def test_no_context_needs_no_trajectories() -> None:

@@ -48,7 +48,8 @@ RAGGED = [
 RETURNS = {0: [3, 4, 4], 1: [8], 3: [1, 6], 4: [4, 4, 8], 5: [3]}
 """By hand, gamma = 1/2: 1 + 4/2, 2 + 4/2, 4; 8; -2 + 6/2, 6; 2 + 4/2, 0 + 8/2, 8; 3."""
 
-DISCOUNTS = {3: [0.125, 0.25, 0.5], 2: [0.25, 0.5], 1: [0.5]}
+DISCOUNTS = {0: [0, 0, 0], 1: [0.5], 3: [0.25, 0.5], 4: [0.125, 0.25, 0.5], 5: [0]}
+"""0 where the task ended the episode."""
 
 
 def check(steps: Steps) -> None:
@@ -61,9 +62,7 @@ def check(steps: Steps) -> None:
     lengths = [len(RETURNS[number]) for number, _ in seen]
     assert times[steps.mask].tolist() == [t for _, t in seen]
     assert returns[steps.mask].tolist() == [RETURNS[number][t] for number, t in seen]
-    assert discounts[steps.mask].tolist() == [
-        DISCOUNTS[length][t] for (_, t), length in zip(seen, lengths, strict=True)
-    ]
+    assert discounts[steps.mask].tolist() == [DISCOUNTS[number][t] for number, t in seen]
     assert final[steps.mask].tolist() == [
         [number, length] for (number, _), length in zip(seen, lengths, strict=True)
     ]

@@ -52,16 +52,20 @@ def pad_trajectories(
 def _with_endings(
     steps: Steps, final_observations: Float[Tensor, "lanes trajectories steps observation"], gamma: float
 ) -> Steps:
-    """The steps with G_t = r_t + gamma G_{t+1}, gamma^(T - t), s_T and t; zero on padding."""
+    """The steps with G_t = r_t + gamma G_{t+1}, gamma^(T - t), s_T and t; zero on padding.
+
+    In an episode that the task ended, 0 takes the place of gamma^(T - t).
+    """
     returns, following = torch.zeros_like(steps.rewards, dtype=torch.float64), torch.zeros(())
     for t in range(returns.shape[-1] - 1, -1, -1):
         returns[..., t] = following = steps.rewards[..., t] + gamma * following
     times = torch.arange(returns.shape[-1], device=returns.device).expand(returns.shape)
     until_end = steps.mask.sum(dim=-1, keepdim=True) - times
+    goes_on = steps.mask & ~steps.terminated.bool().any(dim=-1, keepdim=True)
     return replace(
         steps,
         returns_to_go=returns.float(),
-        discounts_to_end=torch.where(steps.mask, gamma ** until_end.double(), 0.0).float(),
+        discounts_to_end=torch.where(goes_on, gamma ** until_end.double(), 0.0).float(),
         final_observations=final_observations,
         times=torch.where(steps.mask, times, 0),
     )

@@ -24,7 +24,8 @@ class Steps:
         terminated: (...) float, 1 if the task ended the episode, else 0; a time limit is 0.
         mask: (...) bool, False on padding.
         returns_to_go: (...) sum over k of gamma^k r_{t+k} to the end of the episode, for any kind of end.
-        discounts_to_end: (...) gamma^(T - t), the weight of the final observation's value.
+        discounts_to_end: (...) gamma^(T - t), the weight of the final observation's value; 0 if the task
+            ended the episode.
         final_observations: (..., observation_dim), s_T.
         times: (...) int64, t.
 

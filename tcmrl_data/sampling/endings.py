@@ -60,7 +60,9 @@ class Endings:
         is_step = times < lengths[..., None]
         times = np.where(is_step, times, 0)
         returns = np.where(is_step, self.returns_to_go[starts[..., None] + times], 0)
-        discounts = np.where(is_step, self.discounts[lengths[..., None] - times], 0)
+        ended = rows.table[starts + lengths - 1, rows.terminated_column] > 0
+        weighs = is_step & ~ended[..., None]
+        discounts = np.where(weighs, self.discounts[lengths[..., None] - times], 0)
         final = rows.table[starts + lengths, : rows.observation_dim][..., None, :] * is_step[..., None]
         vectors = (*shape, rows.observation_dim)
         device = steps.rewards.device

@@ -1,0 +1,1 @@
+"""MACAW: adaptation by one gradient step, meta-learned through it."""
