@@ -233,7 +233,7 @@ def test_it_collects_by_the_policy_of_the_start_with_noise() -> None:
 
 @pytest.mark.sweep
 def test_adaptation_to_stored_trajectories_raises_the_return(tiny: Dataset, tmp_path: Path) -> None:
-    steps = 1500
+    steps = 600
     overrides = (f"run.steps={steps}", f"run.checkpoint_every={steps}", "batch.context_trajectories=[4]")
     config = resolve_for(tiny, profile="quick", algorithm="macaw", overrides=overrides)
     train_run(tiny, tmp_path / "run", config=config, profile="quick")
