@@ -8,8 +8,8 @@ from tcmrl_data.curation.assembly import check_out, derivation_of
 from tcmrl_data.curation.cutting import Cut
 from tcmrl_data.curation.derive import Derived, summary
 from tcmrl_data.curation.plan import Plan, PlannedPart, Progress, carry_out, no_progress, settle_runs
+from tcmrl_data.curation.view_file import write_view
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.dataset.view import write_view
 from tcmrl_data.envs.tasks import Split, in_order
 from tcmrl_data.foundation.errors import ManifestError, SelectionError
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator

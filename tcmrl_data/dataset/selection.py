@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from tcmrl_data.dataset.tables import Tables
 from tcmrl_data.dataset.tiers import tier_parts
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
@@ -18,7 +19,7 @@ if TYPE_CHECKING:
 _RULE = re.compile(r"all|last|steps>=(\d+)|return>=(0(?:\.\d+)?|1(?:\.0+)?)|tier:(.*)")
 
 
-def chosen_parts(dataset: "Dataset", task: int, rule: str) -> tuple[PartKey, ...]:
+def chosen_parts(dataset: Tables, task: int, rule: str) -> tuple[PartKey, ...]:
     """Parts of a task that a rule of `Dataset.select` leaves, sorted by step and run.
 
     Raises:

@@ -7,14 +7,12 @@ In datasets of several runs a tier takes its snapshots from every run.
 
 import itertools
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import Literal, get_args
 
+from tcmrl_data.dataset.tables import Tables
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_table import PartEntry
-
-if TYPE_CHECKING:
-    from tcmrl_data.dataset.dataset import Dataset
 
 Tier = Literal["random", "medium", "medium-replay", "expert", "medium-expert", "random-expert", "mixed"]
 TIERS: tuple[Tier, ...] = get_args(Tier)
@@ -23,7 +21,7 @@ MEDIUM_SCORE = 33.0
 """D4RL's medium policies reach about a third of the expert's performance (arXiv 2004.07219, section 4)."""
 
 
-def tier_parts(dataset: "Dataset", task: int, tier: str) -> list[PartKey]:
+def tier_parts(dataset: Tables, task: int, tier: str) -> list[PartKey]:
     """The parts of a task that belong to a tier, ascending.
 
     `random` takes step 0; `medium` the first snapshot with a score of at least 33; `medium-replay` all up to
@@ -57,7 +55,7 @@ def tier_parts(dataset: "Dataset", task: int, tier: str) -> list[PartKey]:
     return sorted(entry.key for entry in chosen)
 
 
-def task_scores(dataset: "Dataset", task: int) -> dict[PartKey, float]:
+def task_scores(dataset: Tables, task: int) -> dict[PartKey, float]:
     """The scores of a task's parts, in percent, ascending by key.
 
     Raises:
@@ -68,7 +66,7 @@ def task_scores(dataset: "Dataset", task: int) -> dict[PartKey, float]:
     return {entry.key: _score(entry, best, f"{dataset.path}: {entry.key}") for entry in entries}
 
 
-def medium_scores(dataset: "Dataset", tasks: Sequence[int]) -> dict[PartKey, float]:
+def medium_scores(dataset: Tables, tasks: Sequence[int]) -> dict[PartKey, float]:
     """The scores of the medium snapshots of some tasks, to be compared with `MEDIUM_SCORE`."""
     found: dict[PartKey, float] = {}
     for task in tasks:
