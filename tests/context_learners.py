@@ -8,6 +8,7 @@ from torch import Tensor
 
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
 from tcmrl_algo.methods.base import METHODS
+from tcmrl_algo.methods.stages import StagePlan
 from tcmrl_data import Batch
 from tests.made_up import batch, problem, settings
 
@@ -15,9 +16,11 @@ LearnerT = TypeVar("LearnerT", bound=ContextLearner)
 
 
 def algorithm_of(name: str, config: dict[str, Any], **actor_critic: Any) -> ContextAlgorithm:
-    """A method on the made-up problem."""
-    method = METHODS.get(name)()
-    made = method.create(problem(), settings(**actor_critic), method.Config.model_validate(config))
+    """A method on the made-up problem, with its own stages."""
+    method, shared = METHODS.get(name)(), settings(**actor_critic)
+    own = method.Config.model_validate(config)
+    stages = StagePlan(method.stages(shared, own), steps=shared.run.steps)
+    made = method.create(problem(stages=stages), shared, own)
     assert isinstance(made, ContextAlgorithm)
     return made
 
@@ -46,9 +49,9 @@ def gradients(module: torch.nn.Module, loss: Tensor, parts: Collection[str]) -> 
     return largest
 
 
-def moved(algorithm: ContextAlgorithm, values: Batch | None = None) -> set[str]:
+def moved(algorithm: ContextAlgorithm, values: Batch | None = None, *, step: int = 1) -> set[str]:
     """The parts of a learner that change in one update, all of them in some parameter."""
     before = {name: value.clone() for name, value in algorithm.learner.state_dict().items()}
-    algorithm.update(values or batch(), 1)
+    algorithm.update(values or batch(), step)
     after = algorithm.learner.state_dict()
     return {name.split(".")[0] for name, value in before.items() if not torch.equal(value, after[name])}

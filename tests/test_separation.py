@@ -22,6 +22,9 @@ SETTINGS = (
 )
 SUPERVISED = "unicorn.mode=sup"
 PERCEPTRON = "focal_plus.attention=none"
+# Of the steps, the encoder gets its share alone, and every task gives few pairs to a batch of four tasks.
+CORRO = ("optimizer.learning_rate=1e-3", "corro.encoder_share=0.7", "corro.pairs_per_task=32")
+VAE, RANDOMISED = "corro.negatives=cvae", "corro.negatives=reward_noise"
 GROUPS = 3
 
 
@@ -50,6 +53,8 @@ def groups_of(dataset: Dataset, task: int) -> list[list[Trajectory]]:
         ("focal_plus", ()),
         ("focal_plus", (PERCEPTRON,)),
         ("csro", ()),
+        ("corro", (*CORRO, VAE)),
+        ("corro", (*CORRO, RANDOMISED)),
         ("unicorn", ()),
         ("unicorn", (SUPERVISED,)),
     ],
