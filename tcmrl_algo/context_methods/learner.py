@@ -68,6 +68,10 @@ class ContextLearner(nn.Module, abc.ABC):
         """One context per lane of the task parameters that a method with the capability observes."""
         raise NotImplementedError(f"{type(self).__name__} makes no context of task parameters")
 
+    def controller(self, actor_critic: ActorCritic, steps: Steps) -> Controller:
+        """Acts after the given trajectories, under their one context unless overridden; without gradients."""
+        return actor_critic.controller(self.context(steps))
+
     def explore(self, actor_critic: ActorCritic, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         """As `Algorithm.explore`, for a method that collects its first episodes with its policy."""
         return UniformController()
@@ -154,7 +158,8 @@ class ContextAlgorithm(Algorithm):
     ) -> Controller:
         if privileged is not None:
             return self.actor_critic.controller(self.learner.known_context(privileged))
-        return self.actor_critic.controller(self.context(trajectories))
+        with torch.no_grad():
+            return self.learner.controller(self.actor_critic, self.pack(trajectories))
 
     def latents(self, trajectories: Sequence[Sequence[Trajectory]]) -> Tensor:
         return self.context(trajectories)

@@ -1,0 +1,1 @@
+"""BOReL: a policy that acts by its belief of the task."""
