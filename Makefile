@@ -1,6 +1,7 @@
 # make demo   the whole main job on a small environment, from nothing
 # make test   the tests, but for the sweeps that take minutes
 # make check  what continuous integration runs
+# make docs   the documentation as a site, in build/docs
 PYTHON ?= python3
 SEED ?= 0
 JOBS ?= 2
@@ -10,6 +11,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 INSTALLED_TEST := $(VENV)/.installed-test
+INSTALLED_DOCS := $(VENV)/.installed-docs
+SPHINX := $(BIN)/python -m sphinx --keep-going --quiet
 # The tests of a file stay together, so that its fixtures are made once.
 SPREAD := -n $(JOBS) --dist worksteal
 
@@ -18,7 +21,7 @@ export MPLBACKEND ?= Agg
 # Hundreds of processes would compile the packages again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check format clean
+.PHONY: demo test check format docs docs-links clean
 
 $(BIN)/python:
 	@$(PYTHON) -c "import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), 'Python 3.11 to 3.13 needed: make PYTHON=python3.11'"
@@ -30,7 +33,11 @@ $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(INSTALLED_TEST): $(INSTALLED)
-	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[minari,parquet,ray,tensordict,test,tune]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[docs,minari,parquet,ray,report,tensordict,test,tune]'
+	@touch $@
+
+$(INSTALLED_DOCS): $(INSTALLED)
+	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[docs]'
 	@touch $@
 
 demo: $(INSTALLED)
@@ -54,6 +61,14 @@ check: $(INSTALLED_TEST)
 format: $(INSTALLED_TEST)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
+
+# Needs no network. Links to other sites are checked apart from it, and never by the tests.
+docs: $(INSTALLED_DOCS)
+	$(SPHINX) --builder html --fail-on-warning docs build/docs
+	@echo "build/docs/index.html"
+
+docs-links: $(INSTALLED_DOCS)
+	$(SPHINX) --builder linkcheck docs build/docs-links
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -20,8 +20,10 @@ from tcmrl_cli.frame import print_table
 
 from tcmrl_algo import Evaluation, TaskResult
 from tcmrl_algo.reporting.compose import compose
+from tcmrl_algo.reporting.leaderboard import leaderboard, listed_folders
 from tcmrl_algo.reporting.pages import Pages, unmarked_numbers
-from tcmrl_algo.reporting.write import measure_paths, page_text
+from tcmrl_algo.reporting.sources import read_sources
+from tcmrl_algo.reporting.write import ignore, measure_paths, page_text
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -63,8 +65,15 @@ def recomputed(root: Path) -> Iterator[tuple[Path, str]]:
         page, _ = compose(measure_paths([report.parent]), report.parent)
         yield report, page_text(page)
         yield from ((report.parent / f"{table.name}.csv", table.csv()) for table in page.tables)
+    for record in sorted(results.glob("*/leaderboard.json")):
+        page = leaderboard(read_sources(listed_folders(record), ignore), record.parent)
+        yield record.with_suffix(".md"), page_text(page)
+        yield from ((record.parent / f"{table.name}.csv", table.csv()) for table in page.tables)
     pages = Pages(results, {"evaluation": evaluation, "shown": shown})
-    for file in [root / "README.md", *sorted(root.glob("docs/*.md")), *sorted(results.glob("*.md"))]:
+    for file in [
+        root / "README.md",
+        *(page for page in sorted(root.glob("docs/**/*.md")) if not page.match("docs/results/*/report.md")),
+    ]:
         yield file, pages.rewritten(file.read_text(encoding="utf-8"))
 
 
@@ -96,7 +105,7 @@ def _console(command: str, *tables: "Table") -> str:
     with contextlib.redirect_stdout(output):
         for table in tables:
             print_table(table)
-    return f"```\n{command}\n{output.getvalue().rstrip()}\n```"
+    return f"```console\n{command}\n{output.getvalue().rstrip()}\n```"
 
 
 if __name__ == "__main__":

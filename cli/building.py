@@ -21,6 +21,7 @@ from .frame import (
     same_command,
     stopped_by_signals,
 )
+from .places import complete_environments, complete_recipe_keys
 from .plugins import BEHAVIOR, ENGINE
 from .progress import StageProgress
 
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
 Command = TypeVar("Command", bound=Callable[..., Any])
 
 
-recipe_argument = click.argument("name_or_file", metavar="ENV|FILE")
+recipe_argument = click.argument("name_or_file", metavar="ENV|FILE", shell_complete=complete_environments)
 profile_option = click.option(
     "--profile",
     type=click.Choice(PROFILES),
@@ -41,6 +42,7 @@ profile_option = click.option(
 set_option = click.option(
     "--set",
     "overrides",
+    shell_complete=complete_recipe_keys,
     metavar="SECTION.KEY=VALUE",
     multiple=True,
     help="Override a value of the recipe; repeatable.",

@@ -7,6 +7,7 @@ import click
 
 from .evaluation import BEHAVIOR, FIXED
 from .frame import make_table, number, output_options, print_json, print_table, remark
+from .places import DATASET_PATH
 from .progress import StageProgress
 
 if TYPE_CHECKING:
@@ -16,7 +17,7 @@ COLUMNS = ("uniform", "fixed_snapshot", "fixed_target", "behavior", "oracle")
 
 
 @click.command()
-@click.argument("dataset", metavar="DATASET", type=click.Path(path_type=Path))
+@click.argument("dataset", metavar="DATASET", type=DATASET_PATH)
 @output_options
 def controls(dataset: Path, as_json: bool, quiet: bool) -> None:
     """Measure the controls of DATASET: policies that do not learn across tasks.

@@ -11,13 +11,14 @@ from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.sizes import size
 
 from .frame import fail_incomplete, output_options, print_json, remark
+from .places import DATASET_PATH
 from .progress import PartsProgress, with_progress
 
 if TYPE_CHECKING:
     from tcmrl_data import Derived
 
 TIERS = ("random", "medium", "medium-replay", "expert", "medium-expert", "random-expert", "mixed")
-SOURCE = click.argument("dataset", type=click.Path(path_type=Path))
+SOURCE = click.argument("dataset", type=DATASET_PATH)
 OUT = click.option("--out", type=click.Path(path_type=Path), metavar="FOLDER", help="Folder to create.")
 LABEL = click.option("--label", help="The new dataset's own name.")
 DRY_RUN = click.option("--dry-run", is_flag=True, help="Only say what would be made; write nothing.")
@@ -139,7 +140,7 @@ def _indices(text: str, option: str) -> list[int]:
 
 
 @click.command()
-@click.argument("datasets", nargs=-1, required=True, type=click.Path(path_type=Path))
+@click.argument("datasets", nargs=-1, required=True, type=DATASET_PATH)
 @click.option(
     "--out", type=click.Path(path_type=Path), required=True, metavar="FOLDER", help="Folder to create."
 )

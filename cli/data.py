@@ -7,17 +7,23 @@ import click
 
 from .building import build, plan
 from .cache import cache
+from .card import card, cite, croissant, schema
+from .completion import completion
 from .curation import delete, derive, merge, rename, split
+from .dataset_report import dataset_report
 from .diff import diff
 from .exporting import export
 from .frame import main_program, make_table, output_options, print_json, print_table, remark
 from .importing import import_data
 from .inspection import inspect
+from .quality import coverage, quality, rewards
 from .recipes import recipe
 from .remaking import extend, relabel
+from .rendering import render
 from .show import show
 from .status import status
 from .verification import gc, import_policy, repair, verify
+from .worth import transfer, worth
 
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 
@@ -49,6 +55,7 @@ for _command in (
     status,
     show,
     inspect,
+    dataset_report,
     verify,
     repair,
     gc,
@@ -64,8 +71,18 @@ for _command in (
     export,
     extend,
     relabel,
+    render,
+    completion,
+    card,
+    cite,
+    croissant,
+    schema,
 ):
     data.add_command(_command)
+
+
+for _measure in (quality, coverage, transfer, rewards, worth):
+    inspect.add_command(_measure)
 
 
 @data.command()

@@ -10,6 +10,7 @@ import click
 from tcmrl_data.foundation.plain_files import printable
 
 from .frame import INCOMPLETE, output_options, print_json
+from .places import DATASET_PATH
 
 if TYPE_CHECKING:
     from tcmrl_data import DatasetDiff, DiffLevel
@@ -19,8 +20,8 @@ MOST_LINES = 8
 
 
 @click.command()
-@click.argument("left", type=click.Path(path_type=Path))
-@click.argument("right", type=click.Path(path_type=Path))
+@click.argument("left", type=DATASET_PATH)
+@click.argument("right", type=DATASET_PATH)
 @click.option(
     "--level",
     type=click.Choice(["manifest", "statistics", "arrays"]),

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from .frame import make_table, number, output_options, print_json, print_table, remark
+from .places import RUN_PATH
 from .plugins import ALL_PROTOCOLS, PROTOCOL
 from .progress import StageProgress
 
@@ -86,7 +87,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 @click.command()
-@click.argument("run_folder", metavar="RUN", type=click.Path(path_type=Path))
+@click.argument("run_folder", metavar="RUN", type=RUN_PATH)
 @click.option(
     "--protocol",
     type=PROTOCOL,
@@ -117,6 +118,12 @@ def _mean(values: Sequence[float | None]) -> float | None:
     show_default="the run's",
     help="How many times a protocol with a random first stage is run.",
 )
+@click.option(
+    "--plot",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Also draw the paths of the adapted policy to a .png, .svg or .pdf file (point robots).",
+)
 @output_options
 def evaluate(
     run_folder: Path,
@@ -125,6 +132,7 @@ def evaluate(
     episodes: int | None,
     random_episodes: int | None,
     repeats: int | None,
+    plot: Path | None,
     as_json: bool,
     quiet: bool,
 ) -> None:
@@ -137,14 +145,19 @@ def evaluate(
     with the same policy under the contexts of other tasks. Returns are undiscounted. With --protocol all,
     --json prints a list of documents.
 
+    --plot draws one final episode in every test task, after adaptation and under another task's context.
+
     \b
     Examples:
       tcmrl evaluate runs/point-robot-tcmrl-seed0
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all --json
+      tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol offline --plot paths.png
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol paper --random-episodes 2 --repeats 10
     """
     from tcmrl_algo import evaluate_run
 
+    if plot is not None and protocol == ALL_PROTOCOLS:
+        raise click.UsageError("--plot draws one protocol; name it by --protocol")
     with StageProgress(quiet=quiet) as progress:
         results = []
         for name in _protocols(progress) if protocol == ALL_PROTOCOLS else [protocol]:
@@ -161,6 +174,7 @@ def evaluate(
                     episodes=episodes,
                     random_episodes=random_episodes,
                     repeats=repeats,
+                    plot=plot,
                     report=show,
                 )
             )

@@ -22,6 +22,7 @@ from .frame import (
     same_command,
     stopped_by_signals,
 )
+from .places import complete_experiments
 from .progress import StageProgress
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ NUM_SEEDS = 10_000
 
 
 @click.command()
-@click.argument("name", metavar="FILE|NAME", required=False)
+@click.argument("name", metavar="FILE|NAME", required=False, shell_complete=complete_experiments)
 @click.option("--list", "as_list", is_flag=True, help="List the experiments of this package.")
 @click.option(
     "--out",
@@ -73,6 +74,19 @@ NUM_SEEDS = 10_000
     help="Size of datasets, networks and training: `paper` is the paper's.",
 )
 @click.option("--build", is_flag=True, help="Build the datasets that do not exist.")
+@click.option(
+    "--tuned",
+    type=click.Path(path_type=Path),
+    metavar="FOLDER",
+    help="Take the best settings of the tunings in FOLDER, each in ENV-ALGO, for all methods alike.",
+)
+@click.option(
+    "--reuse",
+    type=click.Path(path_type=Path),
+    multiple=True,
+    metavar="RESULTS",
+    help="Take over equal trainings of another results folder; repeatable.",
+)
 @click.option("--device", default="cpu", show_default=True, help="PyTorch device, such as cpu or cuda.")
 @output_options
 def experiment(
@@ -87,6 +101,8 @@ def experiment(
     environments: tuple[str, ...],
     profile: Profile | None,
     build: bool,
+    tuned: Path | None,
+    reuse: tuple[Path, ...],
     device: str,
     as_json: bool,
     quiet: bool,
@@ -97,7 +113,8 @@ def experiment(
     starts; if datasets are missing, the commands that build them are printed, or --build runs them. With
     --profile, the steps that the file sets give way to the profile's. If the same command is run again, it
     keeps finished runs and continues interrupted runs from their last checkpoint; the results are those of
-    uninterrupted runs. The workers share the cores.
+    uninterrupted runs. The workers share the cores. With --reuse, a method that another experiment trained
+    with the same data, seed and settings is only evaluated, where that experiment did not.
 
     The results folder contains a JSON document per run in runs/, and table.csv. Returns are undiscounted.
 
@@ -107,9 +124,10 @@ def experiment(
       tcmrl experiment tour --workers 2
       tcmrl experiment figure10 --seeds 0-2 --steps 1000 --out results/short
       tcmrl experiment figure4_half_cheetah_vel --profile paper --build --data data/paper
+      tcmrl experiment table2 --tuned tuning --reuse results/figure4_point_robot
       tcmrl experiment mine.toml --data /disk/datasets --only TCMRL --only FOCAL
     """
-    from tcmrl_algo import load_experiment, run_experiment
+    from tcmrl_algo import load_experiment, run_experiment, tuned_settings
     from tcmrl_data import parse_indices
 
     if as_list:
@@ -133,6 +151,8 @@ def experiment(
             steps=steps,
             workers=workers,
             device=device,
+            tuned=None if tuned is None else tuned_settings(loaded, tuned, environments),
+            reuse=reuse,
             report=lambda event: remark(_line(event), quiet=quiet),
         )
     if as_json:
@@ -213,11 +233,16 @@ def _document(report: "ExperimentReport") -> dict[str, Any]:
 
 
 def result_tables(environment: str, results: Sequence["RunResult"]) -> list["Table"]:
-    """Returns of all methods across seeds, with their own contexts and those of other tasks; per protocol."""
+    """Returns of all methods across seeds, with their own contexts and those of other tasks; per protocol.
+
+    Success rates have a column where the environment defines success.
+    """
     from tcmrl_algo import by_method, summarize
 
     here = [result for result in results if result.environment == environment]
-    columns = ("method", "runs", "mean", "95%", "other", "regret")
+    with_success = any(row["success"] is not None for result in here for row in result.rows())
+    success = ("success",) if with_success else ()
+    columns = ("method", "runs", "mean", "95%", "other", "regret", *success)
     tables = []
     for protocol in here[0].evaluations:
         title = f"{environment}, protocol {protocol}: returns on the test tasks"
@@ -230,8 +255,10 @@ def result_tables(environment: str, results: Sequence["RunResult"]) -> list["Tab
             other = summarize([row["shuffled"] for row in chosen]).mean
             regrets = [row["regret"] for row in chosen]
             regret = None if None in regrets else summarize(regrets).mean
-            table.add_row(
-                method, str(len(chosen)), number(final.mean), interval, number(other), number(regret)
-            )
+            cells = [number(final.mean), interval, number(other), number(regret)]
+            if with_success:
+                rates = [row["success"] for row in chosen]
+                cells.append(number(None if None in rates else summarize(rates).mean))
+            table.add_row(method, str(len(chosen)), *cells)
         tables.append(table)
     return tables

@@ -9,12 +9,13 @@ from tcmrl_data.foundation.sizes import size
 
 from .curation import DRY_RUN, TIERS
 from .frame import output_options, print_json
+from .places import DATASET_PATH
 from .plugins import FORMAT
 from .progress import PartsProgress, with_progress
 
 
 @click.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("dataset", type=DATASET_PATH)
 @click.option("--format", "format_name", required=True, type=FORMAT, help="Export format.")
 @click.option(
     "--out",

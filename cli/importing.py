@@ -38,7 +38,7 @@ from .progress import with_progress
 )
 @click.option("--option", "options", multiple=True, metavar="NAME=VALUE", help="Option of the format.")
 @click.option("--label", help="The dataset's own name.")
-@click.option("--licence", help="Licence of the data, recorded as their origin.")
+@click.option("--licence", help="SPDX licence of the data, recorded as their origin.")
 @click.option("--url", help="Where the data come from, recorded as their origin.")
 @click.option("--dry-run", is_flag=True, help="Read and check the files only.")
 @output_options

@@ -1,4 +1,4 @@
-"""`tcmrl-data inspect`: returns, tasks, snapshots and episodes of a dataset."""
+"""`tcmrl-data inspect`: returns, tasks, snapshots and episodes of a dataset; measures are in `quality.py`."""
 
 import json
 import math
@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import click
 
 from .frame import fail_incomplete, make_table, number, output_options, print_json, print_table, remark
+from .places import DATASET_PATH
 
 Command = TypeVar("Command", bound=Callable[..., Any])
 
@@ -30,7 +31,7 @@ class _Inspections(click.Group):
 
 @click.group(cls=_Inspections)
 def inspect() -> None:
-    """Print the returns, tasks, snapshots or episodes of a dataset.
+    """Print what a dataset holds, as tables, JSON or pictures.
 
     DATASET is the dataset's folder or its manifest.json.
 
@@ -43,7 +44,7 @@ def inspect() -> None:
 
 def dataset_command(command: Command) -> Command:
     """Adds the argument DATASET and the options of every inspection."""
-    argument = click.argument("dataset", type=click.Path(path_type=Path))
+    argument = click.argument("dataset", type=DATASET_PATH)
     return argument(output_options(command))
 
 

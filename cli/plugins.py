@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from typing import Any, final
 
 import click
+from click.shell_completion import CompletionItem
 
 
 @final
@@ -32,6 +33,11 @@ class PluginName(click.ParamType):  # type: ignore[type-arg] # generic in newer 
         if value not in self._known():
             raise unknown_name(self._noun, value, self._known())
         return str(value)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        return [CompletionItem(name) for name in self._known() if name.startswith(incomplete)]
 
     def _known(self) -> list[str]:
         from tcmrl_data.foundation.plugins import declared_names

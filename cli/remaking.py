@@ -8,9 +8,10 @@ import click
 from tcmrl_data.foundation.plain_files import printable
 
 from .frame import output_options, print_json
+from .places import DATASET_PATH
 from .progress import with_progress
 
-DATASET = click.argument("dataset", type=click.Path(path_type=Path))
+DATASET = click.argument("dataset", type=DATASET_PATH)
 
 
 @click.command()

@@ -9,10 +9,11 @@ from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.sizes import size
 
 from .frame import make_table, output_options, print_json, print_table, remark
+from .places import DATASET_PATH
 
 
 @click.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("dataset", type=DATASET_PATH)
 @output_options
 def show(dataset: Path, as_json: bool, quiet: bool) -> None:
     """Print a summary of DATASET.

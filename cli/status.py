@@ -9,10 +9,11 @@ import click
 from tcmrl_data.foundation.plain_files import printable
 
 from .frame import duration, make_table, output_options, print_json, print_table
+from .places import DATASET_PATH
 
 
 @click.command()
-@click.argument("dataset", type=click.Path(path_type=Path))
+@click.argument("dataset", type=DATASET_PATH)
 @output_options
 def status(dataset: Path, as_json: bool, quiet: bool) -> None:
     """Print the progress of the build of DATASET, during the build or after it.

@@ -8,6 +8,7 @@ import click
 
 from tcmrl_data.recipe.profile import PROFILES, Profile
 
+from .completion import completion
 from .controls import controls
 from .evaluation import evaluate
 from .experiments import experiment
@@ -20,6 +21,7 @@ from .frame import (
     stopped_by_signals,
     typed_command,
 )
+from .places import DATASET_PATH, complete_training_keys
 from .plugins import ALGORITHM
 from .progress import StageProgress
 from .reports import report
@@ -54,6 +56,7 @@ def tcmrl() -> None:
     """
 
 
+tcmrl.add_command(completion)
 tcmrl.add_command(controls)
 tcmrl.add_command(evaluate)
 tcmrl.add_command(experiment)
@@ -63,7 +66,7 @@ tcmrl.add_command(tune)
 
 
 @tcmrl.command()
-@click.argument("manifest", metavar="MANIFEST", type=click.Path(path_type=Path))
+@click.argument("manifest", metavar="MANIFEST", type=DATASET_PATH)
 @click.option("--algo", type=ALGORITHM, show_default="the recipe's", help="Method to train.")
 @click.option(
     "--profile",
@@ -87,6 +90,7 @@ tcmrl.add_command(tune)
 @click.option(
     "--set",
     "overrides",
+    shell_complete=complete_training_keys,
     metavar="SECTION.KEY=VALUE",
     multiple=True,
     help="Override a training setting; repeatable.",

@@ -20,6 +20,7 @@ from .frame import (
     same_command,
     stopped_by_signals,
 )
+from .places import DATASET_PATH, complete_training_keys
 from .plugins import ALGORITHM, PROTOCOL_NAME
 
 if TYPE_CHECKING:
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("manifest", metavar="MANIFEST", type=click.Path(path_type=Path))
+@click.argument("manifest", metavar="MANIFEST", type=DATASET_PATH)
 @click.option("--algo", type=ALGORITHM, required=True, help="Method to tune.")
 @click.option(
     "--trials",
@@ -77,6 +78,7 @@ if TYPE_CHECKING:
 @click.option(
     "--set",
     "overrides",
+    shell_complete=complete_training_keys,
     metavar="SECTION.KEY=VALUE",
     multiple=True,
     help="Override a training setting in all trials; repeatable.",

@@ -11,12 +11,13 @@ from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.sizes import size
 
 from .frame import duration, fail_incomplete, output_options, print_json
+from .places import DATASET_PATH
 from .progress import StageProgress
 
 if TYPE_CHECKING:
     from tcmrl_data import BuildEvent, VerifyLevel
 
-DATASET = click.argument("dataset", type=click.Path(path_type=Path))
+DATASET = click.argument("dataset", type=DATASET_PATH)
 
 
 @click.command()

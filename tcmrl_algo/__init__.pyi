@@ -40,6 +40,7 @@ from .methods.stages import Stage as Stage
 from .methods.stages import StagedOptimizer as StagedOptimizer
 from .methods.stages import StagePlan as StagePlan
 from .methods.state import TrainedModules as TrainedModules
+from .reporting.leaderboard import write_leaderboard as write_leaderboard
 from .reporting.write import WrittenReport as WrittenReport
 from .reporting.write import write_report as write_report
 from .settings.training import TrainingSettings as TrainingSettings
@@ -60,3 +61,4 @@ from .tuning.record import read_tuning as read_tuning
 from .tuning.tune import EndedTrial as EndedTrial
 from .tuning.tune import TuningReport as TuningReport
 from .tuning.tune import tune_method as tune_method
+from .tuning.tuned import tuned_settings as tuned_settings

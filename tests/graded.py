@@ -8,8 +8,9 @@ import numpy as np
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, Trajectory, open_dataset
+from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.envs.base import DENSE_REWARDS
-from tcmrl_data.envs.tasks import draw_tasks
+from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import Run
@@ -59,26 +60,57 @@ def graded_dataset(
     drawn = draw_tasks(recipe.make_environment())
     if moved:
         drawn = tuple(replace(task, parameters={"goal": [9.0, 9.0]}) for task in drawn)
+    parts = {
+        PartKey(task, step): [
+            _episode(score / 10 + e - (number - 1) / 2, (seed, task, step, e), dense=dense)
+            for e in range(number)
+        ]
+        for task in tasks
+        for step, score in scores.items()
+        for number in ((episodes or {}).get(step, EPISODES),)
+    }
+    return made_dataset(folder, parts, recipe=recipe, drawn=drawn, seed=seed, references=references)
+
+
+def made_dataset(
+    folder: Path,
+    parts: Mapping[PartKey, Sequence[Trajectory]],
+    *,
+    recipe: Recipe | None = None,
+    drawn: Sequence[Task] | None = None,
+    seed: int = 0,
+    references: References = References(uniform=0.0, oracle=10.0, scripted=None),  # noqa: B008
+    snapshots: Mapping[PartKey, Snapshot] | None = None,
+) -> Dataset:
+    """Writes a dataset of given episodes.
+
+    Args:
+        folder: the dataset, new.
+        parts: key to episodes; every task has the same steps.
+        recipe: what it was built from.
+        drawn: all tasks of the recipe.
+        seed: of the build.
+        references: of every part.
+        snapshots: policies of the parts, where there are any.
+    """
+    recipe = recipe or graded_recipe()
+    drawn = drawn or draw_tasks(recipe.make_environment())
     make_folders(folder)
     entries = []
-    for task in tasks:
-        for step, score in scores.items():
-            number = (episodes or {}).get(step, EPISODES)
-            record, data = make_part(
-                settings=recipe.unit_settings(),
-                task=drawn[task],
-                step=step,
-                seed=seed,
-                snapshot=None,
-                trajectories=[
-                    _episode(score / 10 + e - (number - 1) / 2, (seed, task, step, e), dense=dense)
-                    for e in range(number)
-                ],
-                references=references,
-            )
-            replace_file(folder / part_file(PartKey(task, step)), data, staging=folder / STAGING)
-            entries.append(part_entry(record, run=MAIN_RUN, platform=0, archive=data))
-    run = Run(name=MAIN_RUN, kind="built", seed=seed, recipe=recipe, steps=tuple(scores))
+    for key, trajectories in parts.items():
+        record, data = make_part(
+            settings=recipe.unit_settings(),
+            task=drawn[key.task],
+            step=key.step,
+            seed=seed,
+            snapshot=(snapshots or {}).get(key),
+            trajectories=trajectories,
+            references=references,
+        )
+        replace_file(folder / part_file(key), data, staging=folder / STAGING)
+        entries.append(part_entry(record, run=MAIN_RUN, platform=0, archive=data))
+    steps = tuple(sorted({key.step for key in parts}))
+    run = Run(name=MAIN_RUN, kind="built", seed=seed, recipe=recipe, steps=steps)
     write_dataset(
         folder,
         name=recipe.environment.name,
@@ -87,7 +119,7 @@ def graded_dataset(
         runs=[run],
         derivation=None,
         platforms=[UNKNOWN],
-        tasks=[drawn[task] for task in tasks],
+        tasks=[drawn[task] for task in sorted({key.task for key in parts})],
         table=PartTable.empty().with_entries(entries),
     )
     return open_dataset(folder)

@@ -14,14 +14,20 @@ from tcmrl_cli.train import tcmrl
 from tcmrl_algo import Controls, dataset_controls
 from tcmrl_algo.adaptation import controls as controls_module
 from tcmrl_algo.adaptation.control_bench import ControlBench
-from tcmrl_algo.adaptation.fixed import (
+from tcmrl_algo.adaptation.fixed import best_target, with_numbers
+from tcmrl_data import (
+    BelievingController,
+    CheckpointError,
+    Controller,
+    Dataset,
     DeterministicController,
-    best_target,
+    Task,
+    TrainingError,
     first_observation,
     hidden_entries,
-    with_numbers,
+    make_environment,
+    roll_out,
 )
-from tcmrl_data import CheckpointError, Controller, Dataset, Task, TrainingError, make_environment, roll_out
 from tcmrl_data.behavior.snapshot import GaussianController
 from tests.commands import in_process
 
@@ -145,7 +151,7 @@ class Echo(Controller):
 
 def test_a_fixed_policy_keeps_believing_in_its_own_task() -> None:
     hidden, values = np.array([False, True]), np.array([7.0, 8.0])
-    controller = DeterministicController(Echo(), hidden, values)
+    controller = DeterministicController(BelievingController(Echo(), hidden, values))
     assert controller.view == "full"
     noise = controller.draw_noise(np.random.default_rng(0), 3, 2)
     assert noise.shape == (3, 2)

@@ -15,14 +15,17 @@ from tcmrl_cli.frame import print_table
 from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import PROTOCOLS, Evaluation, TaskResult, evaluate_run, open_run, resolve, train_run
+from tcmrl_algo.adaptation.paths import PathPlot
 from tcmrl_data import (
     CheckpointError,
     Dataset,
+    TcmrlError,
     TrainingError,
     Trajectory,
 )
 from tests.adapters import oracle
 from tests.commands import Call, assert_refused, in_process
+from tests.environments import environment_of
 from tests.plugin_packages import install
 from tests.terminal import assert_fits, in_terminal
 
@@ -208,6 +211,24 @@ def test_evaluate_command_changes_the_random_stage(trained: Path, call: Call) ->
     first, second, *_ = document["adaptation_curve"]
     assert more.adaptation_curve[0] == pytest.approx(first)
     assert more.adaptation_curve[1] != pytest.approx(second)
+
+
+def test_plot_draws_the_paths_in_the_test_tasks(trained: Path, call: Call, tmp_path: Path) -> None:
+    file = tmp_path / "paths.svg"
+    code, _, errors = call("evaluate", trained, "--protocol", "offline", "--plot", file, "--quiet")
+    assert code == 0, errors
+    assert "<svg" in file.read_text(encoding="utf-8")[:1000]
+    assert_refused(call("evaluate", trained, "--plot", tmp_path / "paths.gif", "--quiet"), ".png, .svg")
+    assert_refused(call("evaluate", trained, "--protocol", "all", "--plot", file, "--quiet"), "--protocol")
+    assert list(tmp_path.iterdir()) == [file]
+
+
+def test_paths_without_a_plane_cannot_be_drawn(trained: Path, tiny: Dataset, tmp_path: Path) -> None:
+    settings = open_run(trained).record.config.settings.run
+    elsewhere = Dataset(tiny.folder, tiny.manifest)
+    vars(elsewhere)["environment"] = environment_of("half-cheetah-vel")
+    with pytest.raises(TcmrlError, match="half-cheetah-vel has no paths in a plane"):
+        PathPlot(tmp_path / "paths.png", elsewhere, settings)
 
 
 def test_evaluate_command_compares_all_protocols(trained: Path, call: Call) -> None:

@@ -16,7 +16,7 @@ from tcmrl_cli.frame import print_table
 from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
-from tcmrl_algo import experiment_names, load_experiment, open_run, run_experiment, train_run
+from tcmrl_algo import METHODS, experiment_names, load_experiment, open_run, run_experiment, train_run
 from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.job import Job, run_job
 from tcmrl_algo.experiment.planning import plan_runs, resolve_method
@@ -247,20 +247,6 @@ def test_data_may_name_the_one_dataset_itself(tiny_folder: Path, tmp_path: Path)
     assert len(runs) == 10
 
 
-@pytest.mark.parametrize("name", experiment_names())
-def test_every_shipped_experiment_resolves_on_the_recipes_of_its_environments(name: str) -> None:
-    experiment = load_experiment(name)
-    assert experiment.name == name
-    assert len(experiment.seeds) >= 5
-    for environment, choice in experiment.environments.items():
-        table = dict(tcmrl_data.load_recipe(environment).training)[choice.profile or "paper"]  # type: ignore[index]
-        configs = [
-            resolve_method(experiment, table, environment=environment, label=label, place=name)
-            for label in experiment.methods
-        ]
-        assert len({config.model_dump_json() for config in configs}) == len(configs)  # no two are the same
-
-
 def test_a_methods_changes_go_over_the_environments_over_the_experiments(tiny_folder: Path) -> None:
     content = experiments.tables(tiny_folder)
     table = dict(tcmrl_data.load_recipe("point-robot").training)["quick"]
@@ -372,3 +358,27 @@ def test_an_experiment_without_protocols_evaluates_by_the_papers_three(tiny_fold
     content = experiments.tables(tiny_folder)
     del content["protocols"]
     assert read_experiment(content, place="test").protocols == ("paper", "offline", "idaq")
+
+
+def test_a_file_like_another_takes_what_it_leaves_out(tiny_folder: Path, tmp_path: Path) -> None:
+    model = experiments.tables(tiny_folder)
+    experiments.write_file(tmp_path / "model.toml", model)
+    changes = {"like": "model.toml", "name": "other", "seeds": [7], "protocols": ["idaq"]}
+    found = load_experiment(experiments.write_file(tmp_path / "other.toml", changes))
+    del changes["like"]
+    assert found == read_experiment(model | changes, place="test")
+    experiments.write_file(tmp_path / "third.toml", {"like": "other.toml", "name": "third"})
+    with pytest.raises(TrainingError, match=r"third.toml', like: other.toml is itself like model.toml"):
+        load_experiment(tmp_path / "third.toml")
+    experiments.write_file(tmp_path / "fourth.toml", {"like": 4, "name": "fourth"})
+    with pytest.raises(TrainingError, match="name one experiment, not 4"):
+        load_experiment(tmp_path / "fourth.toml")
+
+
+def test_the_same_methods_are_compared_in_every_panel_of_figure_4() -> None:
+    panels = [load_experiment(name) for name in experiment_names() if name.startswith("figure4_")]
+    assert len(panels) == 9
+    assert len({json.dumps(panel.to_json()["methods"]) for panel in panels}) == 1
+    assert {panel.protocols for panel in panels} == {load_experiment("table2").protocols}
+    own = {name for name, kind in METHODS.working().items() if kind.__module__.startswith("tcmrl_algo.")}
+    assert {method.algorithm for method in panels[0].methods.values()} == own

@@ -32,13 +32,14 @@ def test_missing_datasets_are_all_named_with_their_commands(tmp_path: Path, call
     data = tmp_path / "data"
     missing = missing_datasets(load_experiment("table2"), data)
     assert [(found.environment, found.profile) for found in missing] == [
-        ("sparse-point-robot", "paper"),
+        ("point-robot", "paper"),
         ("point-robot-wind", "paper"),
+        ("sparse-point-robot", "paper"),
         ("half-cheetah-vel", "reduced"),
     ]
     commands = [f"`{found.command}`" for found in missing]
     assert (
-        commands[2] == f"`tcmrl-data build half-cheetah-vel --profile reduced --out {data}/half-cheetah-vel`"
+        commands[3] == f"`tcmrl-data build half-cheetah-vel --profile reduced --out {data}/half-cheetah-vel`"
     )
     assert_refused(call("experiment", "table2", "--data", data), *commands, "--build")
     assert not (tmp_path / "results").exists()
@@ -126,3 +127,14 @@ def test_build_makes_what_is_missing_and_then_runs(tmp_path: Path, call: Call) -
     code, output, _ = call("experiment", file, "--out", tmp_path / "out", "--build", "--json", "--quiet")
     assert (code, json.loads(output)["ran"]) == (0, 1)
     assert tcmrl_data.open_dataset(tmp_path / "data").manifest.profile == "quick"
+
+
+def test_data_may_be_a_view_file(tiny_folder: Path, tmp_path: Path) -> None:
+    view = tmp_path / "half.json"
+    tcmrl_data.derive_dataset(tiny_folder, view=view, snapshots="last")
+    experiment = _small(tiny_folder, environments={"point-robot": {"profile": "quick"}})
+    planned = plan_runs(experiment, data=view)
+    assert {run.dataset for run in planned} == {view}
+    assert {run.root for run in planned} == {tcmrl_data.open_dataset(view).manifest.root}
+    (missing,) = missing_datasets(experiment, tmp_path / "none.json")
+    assert missing.folder == tmp_path / "none.json" / "point-robot"

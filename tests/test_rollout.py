@@ -169,7 +169,8 @@ def test_episodes_do_not_depend_on_their_neighbours(environment: Environment) ->
 def test_the_numpy_batch_equals_single_environments(environment: Environment) -> None:
     tasks = [{"goal": [0.0, 1.0], "wind": [0.02, 0.0]}, {"goal": [1.0, 0.0], "wind": [0.01, -0.03]}]
     batch = roll(environment, environment.lanes(tasks), UniformController())
-    single = roll(environment, EnvironmentLanes(environment, tasks, "stored"), UniformController())
+    one_by_one = EnvironmentLanes(environment, [environment.make(task, view="full") for task in tasks])
+    single = roll(environment, one_by_one, UniformController())
     for left, right in zip(batch, single, strict=True):
         assert np.array_equal(left.observations, right.observations)
         assert np.array_equal(left.rewards, right.rewards)

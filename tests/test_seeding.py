@@ -62,4 +62,7 @@ def test_purposes_keep_their_numbers() -> None:
         "EVALUATION_CANDIDATES": 17,
         "CONTROL_RESET": 18,
         "TUNING": 19,
+        "TRANSFER_RESET": 20,
+        "TRANSFER_NOISE": 21,
+        "VISIBILITY": 22,
     }

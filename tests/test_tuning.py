@@ -133,7 +133,6 @@ def test_a_score_is_the_mean_over_protocols_and_the_best_trial_has_the_highest(
     assert first.values["tcmrl.weights.distance"] == 0.1  # the table as it is
     assert first.values != second.values
     assert {"optuna", "torch", "tcmrl"} <= set(tuning.versions)
-    assert tuning.root == tcmrl_data.open_dataset(tuning.dataset).manifest.root
 
 
 def test_the_same_command_does_nothing_again_and_prints_settings_that_train_takes(

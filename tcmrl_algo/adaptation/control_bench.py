@@ -8,14 +8,18 @@ import numpy as np
 
 from tcmrl_algo.adaptation.arena import ProgressCallback
 from tcmrl_algo.adaptation.control_records import FixedSnapshot, FixedTarget, TaskControls
-from tcmrl_algo.adaptation.fixed import (
+from tcmrl_algo.adaptation.fixed import best_target
+from tcmrl_algo.adaptation.lane_stage import LaneStage
+from tcmrl_data import (
+    BelievingController,
+    Controller,
+    Dataset,
     DeterministicController,
-    best_target,
+    Purpose,
+    Task,
     first_observation,
     hidden_entries,
 )
-from tcmrl_algo.adaptation.lane_stage import LaneStage
-from tcmrl_data import Controller, Dataset, Purpose, Task
 
 TEST_EPISODES = 5
 """Episodes per policy and test task; one per policy and training task choose the fixed policies."""
@@ -160,6 +164,6 @@ class ControlBench:
 
         def control(lanes: Sequence[Task]) -> Controller:
             acting = snapshot.controller(environment, [task.parameters] * len(lanes))
-            return DeterministicController(acting, self._hidden, believed)
+            return DeterministicController(BelievingController(acting, self._hidden, believed))
 
         return control

@@ -1,6 +1,6 @@
 """Meta-testing: adapts a trained run to the test tasks, and compares its returns with controls."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from statistics import fmean
 
@@ -10,6 +10,7 @@ import torch
 from tcmrl_algo.adaptation.arena import Arena, Context, ProgressCallback, ignore_progress
 from tcmrl_algo.adaptation.control_records import Controls
 from tcmrl_algo.adaptation.controls import dataset_controls
+from tcmrl_algo.adaptation.paths import FinalEpisodes, PathPlot
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS, Adaptation
 from tcmrl_algo.adaptation.results import Evaluation, Reference, TaskResult
 from tcmrl_algo.settings.run import RunSettings
@@ -31,6 +32,7 @@ def evaluate_run(
     episodes: int | None = None,
     random_episodes: int | None = None,
     repeats: int | None = None,
+    plot: Path | None = None,
     report: ProgressCallback = ignore_progress,
 ) -> Evaluation:
     """Evaluates the newest checkpoint of a run, and logs the means in the folder of the run.
@@ -42,12 +44,14 @@ def evaluate_run(
         episodes: replaces the number of adaptation episodes per task of the run.
         random_episodes: replaces `run.random_episodes`, how many of them form the first stage.
         repeats: replaces `run.repeats`, how many times a protocol with a random first stage is run.
+        plot: picture to write, of the paths of the adapted policy in the test tasks.
         report: called when episodes end.
 
     Raises:
         CheckpointError: no run, no checkpoint, or not the dataset that the run was trained on.
         TrainingError: the dataset holds no test task.
         UnknownNameError: an unknown protocol; the message lists the nearest names.
+        RenderingError: the environment's paths cannot be drawn, or the picture's ending is not known.
 
     Example:
         >>> evaluation = evaluate_run("runs/point-robot-tcmrl-seed0", protocol="idaq")  # doctest: +SKIP
@@ -64,7 +68,8 @@ def evaluate_run(
     }
     settings = settings.model_copy(update={key: value for key, value in changes.items() if value is not None})
     torch.set_num_threads(settings.threads)
-    evaluation = evaluate_open_run(run, dataset, settings, report=report)
+    show = ignore_episodes if plot is None else PathPlot(plot, dataset, settings)
+    evaluation = evaluate_open_run(run, dataset, settings, report=report, show=show)
     scores = {
         "final": evaluation.mean_final,
         "shuffled": evaluation.mean_shuffled,
@@ -75,10 +80,27 @@ def evaluate_run(
     return evaluation
 
 
+def ignore_episodes(episodes: FinalEpisodes) -> None:
+    """Ignores final episodes."""
+
+
 def evaluate_open_run(
-    run: Run, dataset: Dataset, settings: RunSettings, *, report: ProgressCallback = ignore_progress
+    run: Run,
+    dataset: Dataset,
+    settings: RunSettings,
+    *,
+    report: ProgressCallback = ignore_progress,
+    show: Callable[[FinalEpisodes], None] = ignore_episodes,
 ) -> Evaluation:
-    """As `evaluate_run`, for an open run and dataset; `settings` may differ from those of the run."""
+    """As `evaluate_run`, for an open run and dataset.
+
+    Args:
+        run: the run.
+        dataset: its dataset.
+        settings: may differ from those of the run.
+        report: called when episodes end.
+        show: called with the final episodes of all tasks.
+    """
     protocol = PROTOCOLS.get(settings.protocol)()
     tasks = dataset.test_tasks
     if not tasks:
@@ -97,7 +119,7 @@ def evaluate_open_run(
         arena.begin("adaptation", len(tasks) * repeats * settings.episodes)
         adaptations = protocol.adapt(arena, [task for task in tasks for _ in range(repeats)])
         by_task = [adaptations[repeats * place :][:repeats] for place in range(len(tasks))]
-        results = _results(arena, tasks, by_task, controls)
+        results = _results(arena, tasks, by_task, controls, show)
     finally:
         arena.close()
     return Evaluation(
@@ -119,7 +141,11 @@ def evaluate_open_run(
 
 
 def _results(
-    arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Sequence[Adaptation]], controls: Controls
+    arena: Arena,
+    tasks: Sequence[Task],
+    adaptations: Sequence[Sequence[Adaptation]],
+    controls: Controls,
+    show: Callable[[FinalEpisodes], None],
 ) -> list[TaskResult]:
     """Results of every task, given its adaptations, one per repeat."""
     own = {
@@ -131,6 +157,7 @@ def _results(
     arena.begin("final episodes", num_contexts * arena.settings.final_episodes)
     final = _final_episodes(arena, tasks, own)
     shuffled = _final_episodes(arena, tasks, others)
+    show(FinalEpisodes(final, shuffled))
     results = []
     for task, repeats in zip(tasks, adaptations, strict=True):
         references, control = arena.dataset.references(task.index), controls.task(task.index)

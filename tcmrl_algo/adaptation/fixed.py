@@ -1,62 +1,18 @@
-"""Policies that act the same in every task: what a method is worth that does not adapt at all."""
+"""The best target of an oracle that acts the same in every task: what a method is worth that never adapts."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, final
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tcmrl_algo.methods.privileged import SMALLEST_STD, numbers
-from tcmrl_data import Controller, Environment, Task, Transition
+from tcmrl_data import Task
 
 FloatArray = npt.NDArray[np.floating]
-BoolArray = npt.NDArray[np.bool_]
 
 MOST_EVALUATIONS = 200
 """Of the search for a target; two coordinates take about 80."""
-
-
-@final
-class DeterministicController(Controller):
-    """Another controller without its noise, which for a Gaussian policy is its most likely action.
-
-    Args:
-        controller: whose actions these are.
-        hidden: (observation_dim,) bool, entries of its observations to replace.
-        values: (observation_dim,), what to replace them by.
-    """
-
-    def __init__(self, controller: Controller, hidden: BoolArray, values: FloatArray) -> None:
-        self.view = controller.view
-        self._controller, self._hidden, self._values = controller, hidden, values
-
-    def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
-        return np.zeros((num_steps, action_dim), dtype=np.float32)
-
-    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
-        if self.view == "full":
-            observations = np.where(self._hidden, self._values, observations)
-        return self._controller.act(observations, noise)
-
-    def observe(self, transition: Transition) -> None:
-        self._controller.observe(transition)
-
-
-def hidden_entries(environment: Environment) -> BoolArray:
-    """(observation_dim,), entries of full observations that the stored view hides."""
-    shown = np.ones(environment.observation_dim)
-    found: BoolArray = environment.stored_view(shown) != shown
-    return found
-
-
-def first_observation(environment: Environment, task: Task) -> FloatArray:
-    """(observation_dim,), the full observation after a reset; hidden entries tell the task."""
-    lanes = environment.lanes([task.parameters])
-    try:
-        found: FloatArray = lanes.reset([0])[0]
-        return found
-    finally:
-        lanes.close()
 
 
 def best_target(

@@ -11,7 +11,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data import Profile, TrainingError
+from tcmrl_data import CheckpointError, Profile, TrainingError
+from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.plugins import unknown_name
 from tcmrl_data.foundation.validation import validate_table
 
@@ -21,16 +22,20 @@ Metric = Literal[
     "regret",
     "normalized",
     "shuffled",
+    "fixed",
     "training_seconds",
     "peak_memory",
     "context_ratio",
     "attention_zero",
     "attention_nonzero",
 ]
-"""What a claim compares; `reporting.claims` says how a run gives them."""
+"""What a claim compares; `reporting.claims` says how a run gives them. `fixed` is the return of the best
+policy that acts the same in all tasks, fitted on the training tasks."""
 
 PAPER_PROTOCOLS = ("paper", "offline", "idaq")
 """By which the paper adapts, in its order; what an experiment evaluates by unless it says otherwise."""
+LIKE = "like"
+"""The key of a file that names another file, whose keys it takes where it has none."""
 
 
 class _Table(BaseModel):
@@ -45,12 +50,14 @@ class EnvironmentChoice(_Table):
         dataset_profile: the profile that its dataset is built with; any where unset.
         profile: whose training table to start from; the one the dataset was built with where unset.
         training: changes of that table.
+        tuning: of which environment the tuned settings are, in a run with some; its own where unset.
     """
 
     dataset: str | None = None
     dataset_profile: Profile | None = None
     profile: str | None = None
     training: dict[str, Any] = {}
+    tuning: str | None = None
 
 
 class MethodChoice(_Table):
@@ -184,28 +191,19 @@ class Experiment(_Table):
 def load_experiment(name: str | Path) -> Experiment:
     """An experiment from a TOML file, or by the name of one that comes with the package.
 
+    A file may say `like = "NAME"`, another experiment of the package or a TOML file beside it, from which it
+    takes every top-level key that it leaves out. The experiment that is read holds them all.
+
     Raises:
         UnknownNameError: no experiment has such a name; says the nearest names.
-        TrainingError: no such file, no TOML, an unknown key, a wrong type or a contradiction.
+        TrainingError: no such file, no TOML, an unknown key, a wrong type or a contradiction, or a file
+            that is like one that is like another.
 
     Example:
         >>> load_experiment("figure5").source
         'Figure 5'
     """
-    file: Path | Traversable = Path(name)
-    if Path(name).suffix != ".toml":
-        if name not in experiment_names():
-            raise unknown_name("experiment", str(name), experiment_names())
-        file = _shipped() / f"{name}.toml"
-    try:
-        tables = tomllib.loads(file.read_text(encoding="utf-8"))
-    except (FileNotFoundError, IsADirectoryError):
-        raise TrainingError(
-            f"no experiment file {name}; name a TOML file, or one that `tcmrl experiment --list` shows"
-        ) from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise TrainingError(f"{name} is no TOML file: {error}") from None
-    return read_experiment(tables, place=f"experiment {str(name)!r}")
+    return read_experiment(_tables(name), place=f"experiment {str(name)!r}")
 
 
 def read_experiment(tables: Mapping[str, Any], *, place: str) -> Experiment:
@@ -215,6 +213,25 @@ def read_experiment(tables: Mapping[str, Any], *, place: str) -> Experiment:
         TrainingError: names the first problem and the place.
     """
     return validate_table(Experiment, tables, place=place, error=TrainingError)
+
+
+def experiment_of(folder: Path) -> Experiment:
+    """The experiment whose results a folder holds.
+
+    Raises:
+        CheckpointError: there is none, or its file is damaged.
+        TrainingError: the file is of something else.
+    """
+    file, again = folder / "experiment.json", "run `tcmrl experiment` again to rewrite the file"
+    try:
+        tables = parse_json(file.read_bytes())
+    except FileNotFoundError:
+        raise CheckpointError(f"{folder} holds no results of `tcmrl experiment`") from None
+    except ValueError as error:
+        raise CheckpointError(f"{file}: {error}; {again}") from None
+    if not isinstance(tables, dict):
+        raise TrainingError(f"{file} is not an experiment; {again}")
+    return read_experiment(tables, place=str(file))
 
 
 def experiment_names() -> list[str]:
@@ -248,6 +265,38 @@ def _without_steps(training: Mapping[str, Any]) -> dict[str, Any]:
     if isinstance(run := changes.get("run"), Mapping):
         changes["run"] = {key: value for key, value in run.items() if key != "steps"}
     return changes
+
+
+def _tables(name: str | Path) -> dict[str, Any]:
+    """The tables of an experiment file, with those of the file that it is like."""
+    tables = _read_file(name)
+    if LIKE not in tables:
+        return tables
+    model = tables.pop(LIKE)
+    if not isinstance(model, str):
+        raise TrainingError(f"experiment {str(name)!r}, {LIKE}: name one experiment, not {model!r}")
+    shared = _read_file(Path(name).parent / model if model.endswith(".toml") else model)
+    if LIKE in shared:
+        raise TrainingError(
+            f"experiment {str(name)!r}, {LIKE}: {model} is itself like {shared[LIKE]}; name that one"
+        )
+    return shared | tables
+
+
+def _read_file(name: str | Path) -> dict[str, Any]:
+    file: Path | Traversable = Path(name)
+    if Path(name).suffix != ".toml":
+        if name not in experiment_names():
+            raise unknown_name("experiment", str(name), experiment_names())
+        file = _shipped() / f"{name}.toml"
+    try:
+        return tomllib.loads(file.read_text(encoding="utf-8"))
+    except (FileNotFoundError, IsADirectoryError):
+        raise TrainingError(
+            f"no experiment file {name}; name a TOML file, or one that `tcmrl experiment --list` shows"
+        ) from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise TrainingError(f"{name} is no TOML file: {error}") from None
 
 
 def _shipped() -> Traversable:

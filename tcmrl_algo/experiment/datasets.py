@@ -12,6 +12,7 @@ from tcmrl_data import (
     SelectionError,
     TrainingError,
     build_dataset,
+    is_view_file,
     load_recipe,
     open_dataset,
     split_dataset,
@@ -48,7 +49,7 @@ def missing_datasets(experiment: Experiment, data: Path) -> list[MissingDataset]
     return [
         MissingDataset(environment, folder, _profile_to_build(choice))
         for environment, choice in experiment.environments.items()
-        if not ((folder := _folder(environment, choice, data)) / "manifest.json").is_file()
+        if not _is_dataset(folder := _folder(environment, choice, data))
     ]
 
 
@@ -110,9 +111,14 @@ def fold_datasets(dataset: Dataset, views: Path, folds: int) -> list[Dataset]:
 
 
 def _folder(environment: str, choice: EnvironmentChoice, data: Path) -> Path:
-    if (data / "manifest.json").is_file():
+    if _is_dataset(data):
         return data
     return Path(choice.dataset) if choice.dataset else data / environment
+
+
+def _is_dataset(path: Path) -> bool:
+    """Whether it is a dataset's folder or a view file."""
+    return path.is_file() if is_view_file(path) else (path / "manifest.json").is_file()
 
 
 def _profile_to_build(choice: EnvironmentChoice) -> Profile:

@@ -6,7 +6,6 @@ killed one goes on from the newest checkpoint and ends in the same tensors.
 
 import importlib.metadata
 import time
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +13,7 @@ import torch
 from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.adaptation.evaluate import evaluate_run
-from tcmrl_algo.adaptation.results import Evaluation
-from tcmrl_algo.experiment.results import CurvePoint, RunResult, result_file
+from tcmrl_algo.experiment.results import CurvePoint, RunResult, Tuned, result_file
 from tcmrl_algo.training.checkpoint import open_run, tensors_digest
 from tcmrl_algo.training.config import TrainingConfig, stage_plan
 from tcmrl_algo.training.train import TrainingProgress, resume_run, train_run
@@ -24,6 +22,23 @@ from tcmrl_data.engine.worker import Send, serve
 from tcmrl_data.foundation.records import read_record, write_record
 
 MEANS = ("final", "regret", "normalized", "shuffled")
+
+
+class SharedTraining(BaseModel):
+    """What a run takes over from a finished one of equal training.
+
+    Attributes:
+        training_of: `experiment, method` of that run.
+        training_seconds, peak_memory: what it took.
+        evaluations: its documents under protocols with equal settings.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    training_of: str
+    training_seconds: float | None
+    peak_memory: int | None
+    evaluations: dict[str, dict[str, Any]] = {}
 
 
 class Job(BaseModel):
@@ -37,6 +52,8 @@ class Job(BaseModel):
         config: resolved, `run.threads` included.
         device: a torch device.
         protocols, curve_points: how it is evaluated.
+        tuned: where its settings come from, if they were tuned.
+        shared: what it takes over from an equal training.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -55,6 +72,8 @@ class Job(BaseModel):
     device: str
     protocols: tuple[str, ...]
     curve_points: int
+    tuned: Tuned | None = None
+    shared: SharedTraining | None = None
 
     def points(self) -> list[int]:
         """Steps at which the learning curve is evaluated; the last one is the end of training."""
@@ -81,23 +100,26 @@ def run_job(job: Job, report: Send) -> str:
         raise CheckpointError(f"{job.dataset} was changed after this experiment began; start it anew")
     file = folder / "curve.json"
     curve = read_record(Curve, file).points if file.is_file() else ()
-    evaluations: dict[str, Evaluation] = {}
+    shared = {} if job.shared is None else job.shared.evaluations
+    evaluations: dict[str, dict[str, Any]] = {}
     stages = stage_plan(job.config)
     for step in job.points()[len(curve) :]:
         timed_steps, seconds = _train_to(step, job, dataset, report)
         began = time.perf_counter()
         is_last = step == job.points()[-1]
         evaluations = {
-            protocol: evaluate_run(
+            protocol: shared[protocol]
+            if is_last and protocol in shared
+            else evaluate_run(
                 folder, protocol=protocol, dataset_path=job.dataset, repeats=None if is_last else 1
-            )
+            ).to_json()
             for protocol in (job.protocols if is_last else job.protocols[:1])
         }
         first = evaluations[job.protocols[0]]
         point = CurvePoint(
             step=step,
             stage=stages.at(step).stage,
-            **{name: getattr(first, f"mean_{name}") for name in MEANS},
+            **{name: first[f"mean_{name}"] for name in MEANS},
             timed_steps=timed_steps,
             seconds=seconds,
             evaluation_seconds=time.perf_counter() - began,
@@ -141,10 +163,11 @@ def _train_to(step: int, job: Job, dataset: Dataset, report: Send) -> tuple[int,
     return step, done.seconds
 
 
-def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: Mapping[str, Evaluation]) -> RunResult:
+def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: dict[str, dict[str, Any]]) -> RunResult:
     run = open_run(job.folder)
     timed, seconds = sum(point.timed_steps for point in curve), sum(point.seconds for point in curve)
-    steps = run.record.steps
+    steps, shared = run.record.steps, job.shared
+    memory = max(point.device_memory or point.peak_memory for point in curve)
     return RunResult(
         **job.model_dump(
             include={"experiment", "method", "environment", "seed", "fold", "profile", "dataset", "root"}
@@ -159,10 +182,12 @@ def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: Mapping[str, E
         versions=run.record.versions | {"tcmrl": importlib.metadata.version("tcmrl")},
         digest=tensors_digest(run.newest().tensors()),
         curve=curve,
-        evaluations={name: found.to_json() for name, found in evaluations.items()},
-        training_seconds=seconds * steps / timed if timed else None,
+        evaluations=evaluations,
+        training_seconds=shared.training_seconds if shared else seconds * steps / timed if timed else None,
         evaluation_seconds=sum(point.evaluation_seconds for point in curve),
-        peak_memory=max(point.device_memory or point.peak_memory for point in curve),
+        peak_memory=shared.peak_memory if shared else memory,
+        tuned=job.tuned,
+        training_of=shared.training_of if shared else None,
     )
 
 

@@ -8,8 +8,12 @@ from typing import Any
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.experiment.config import Experiment, override_texts, run_id
 from tcmrl_algo.experiment.datasets import fold_datasets, open_datasets
+from tcmrl_algo.experiment.results import Tuned
 from tcmrl_algo.training.config import TrainingConfig, installed_table, resolve
 from tcmrl_data import CheckpointError, Dataset, TcmrlError, TrainingError
+
+TunedSettings = Mapping[str, Mapping[str, Tuned]]
+"""Tuned settings by environment and algorithm."""
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,7 @@ class PlannedRun:
         profile: whose training table it starts from.
         config: the resolved configuration; its `run.threads` is the driver's to set.
         protocols, curve_points: how it is evaluated.
+        tuned: where its settings come from, if they were tuned.
     """
 
     id: str
@@ -38,6 +43,7 @@ class PlannedRun:
     config: TrainingConfig
     protocols: tuple[str, ...]
     curve_points: int
+    tuned: Tuned | None = None
 
     def identity(self) -> dict[str, Any]:
         """Everything that the run's result is a function of, beside code, device and threads."""
@@ -61,6 +67,7 @@ def plan_runs(
     environments: Sequence[str] = (),
     seeds: Sequence[int] | None = None,
     steps: int | None = None,
+    tuned: TunedSettings | None = None,
 ) -> list[PlannedRun]:
     """Every run, all methods under one seed before the next seed.
 
@@ -72,6 +79,8 @@ def plan_runs(
         environments: instead of all of the experiment's.
         seeds: instead of the experiment's.
         steps: training steps instead of `run.steps`, of runs and schedules.
+        tuned: settings of environments and algorithms, which methods' own changes go over; the training
+            table's where None.
 
     Raises:
         SelectionError: a dataset is missing, of another environment or profile, without test tasks, or
@@ -85,9 +94,15 @@ def plan_runs(
         environment: choice.profile or datasets[environment].manifest.profile
         for environment, choice in experiment.environments.items()
     }
+
+    def found(environment: str, label: str) -> Tuned | None:
+        return None if tuned is None else tuned[environment][experiment.methods[label].algorithm]
+
     configs = {
         environment: {
-            label: _config(experiment, dataset, profiles[environment], label, steps)
+            label: _config(
+                experiment, dataset, profiles[environment], label, steps, found(environment, label)
+            )
             for label in experiment.methods
         }
         for environment, dataset in datasets.items()
@@ -107,6 +122,7 @@ def plan_runs(
             config=config,
             protocols=experiment.protocols,
             curve_points=experiment.curve_points,
+            tuned=found(environment, label),
         )
         for environment in datasets
         for seed in (experiment.seeds if seeds is None else seeds)
@@ -172,15 +188,20 @@ def resolve_method(
     place: str,
     steps: int | None = None,
     fallback: Mapping[str, Any] | None = None,
+    tuned: Tuned | None = None,
 ) -> TrainingConfig:
-    """A method's configuration: the training table, then changes of experiment, environment and method.
+    """A method's configuration: the table, then changes of experiment, environment, tuning and method.
 
     Raises:
         TrainingError: what results does not validate, or is shorter than the learning curve.
     """
     method = experiment.methods[label]
-    changes = (experiment.training, experiment.environments[environment].training, method.training)
-    texts = [text for table_changes in changes for text in override_texts(table_changes)]
+    texts = [
+        *override_texts(experiment.training),
+        *override_texts(experiment.environments[environment].training),
+        *(tuned.overrides if tuned else ()),
+        *override_texts(method.training),
+    ]
     if steps is not None:
         texts.append(f"run.steps={steps}")
     config = resolve(table, place=place, algorithm=method.algorithm, overrides=texts, fallback=fallback)
@@ -193,7 +214,12 @@ def resolve_method(
 
 
 def _config(
-    experiment: Experiment, dataset: Dataset, profile: str, label: str, steps: int | None
+    experiment: Experiment,
+    dataset: Dataset,
+    profile: str,
+    label: str,
+    steps: int | None,
+    tuned: Tuned | None,
 ) -> TrainingConfig:
     place = f"experiment {experiment.name!r}, method {label!r} on {dataset.name!r}, profile {profile!r}"
     table = {str(name): values for name, values in dataset.manifest.training.items()}.get(profile)
@@ -208,6 +234,7 @@ def _config(
         place=place,
         steps=steps,
         fallback=installed_table(dataset.name, profile),
+        tuned=tuned,
     )
     for rule in (config.settings.run.snapshots, config.settings.run.context_snapshots):
         if rule is not None:

@@ -24,6 +24,7 @@ COLUMNS = (
     "regret",
     "normalized",
     "shuffled",
+    "success",
     "steps",
     "training_seconds",
     "evaluation_seconds",
@@ -66,6 +67,26 @@ class CurvePoint(_Record):
     device_memory: int
 
 
+class Tuned(_Record):
+    """The best settings of a tuning, and what it took to find them.
+
+    Attributes:
+        environment, root, profile: what the method was tuned on, from whose training table.
+        trials, steps, seeds: how many trials, of how many training steps, with which seeds each.
+        score: of the best trial: a mean normalised return on held-out training tasks.
+        overrides: its settings, as `section.key=value` texts.
+    """
+
+    environment: str
+    root: str
+    profile: str
+    trials: int
+    steps: int
+    seeds: tuple[int, ...]
+    score: float
+    overrides: tuple[str, ...]
+
+
 class ContextMeasures(_Record):
     """What a report measures of a run's contexts and attention; it needs the checkpoint and the dataset.
 
@@ -105,6 +126,8 @@ class RunResult(_Record):
             them; None where none was timed.
         evaluation_seconds: of all evaluations.
         peak_memory: bytes, of the process, or of the CUDA device where there is one.
+        tuned: where its settings come from, if they were tuned.
+        training_of: `experiment, method` whose training it shares, if it was not trained for this one.
         contexts: what a report measured of its contexts; None before, and without a checkpoint.
     """
 
@@ -131,6 +154,8 @@ class RunResult(_Record):
     training_seconds: float | None
     evaluation_seconds: float | None
     peak_memory: int | None
+    tuned: Tuned | None = None
+    training_of: str | None = None
     contexts: ContextMeasures | None = None
 
     @property
@@ -150,8 +175,15 @@ class RunResult(_Record):
             shared
             | {"protocol": protocol}
             | {name: evaluation[f"mean_{name}"] for name in ("final", "regret", "normalized", "shuffled")}
+            | {"success": success_rate(evaluation)}
             for protocol, evaluation in self.evaluations.items()
         ]
+
+
+def success_rate(evaluation: Mapping[str, Any]) -> float | None:
+    """Share of successful final episodes, mean over test tasks; None where the environment has no success."""
+    shares = [task.get("success") for task in evaluation["tasks"]]
+    return None if None in shares or not shares else sum(shares) / len(shares)
 
 
 def table_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = COLUMNS) -> str:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 from tcmrl_algo.experiment.config import Experiment, run_id
 from tcmrl_algo.experiment.job import Job
-from tcmrl_algo.experiment.planning import PlannedRun, check_same, plan_runs
+from tcmrl_algo.experiment.planning import PlannedRun, TunedSettings, check_same, plan_runs
 from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file, table_text
+from tcmrl_algo.experiment.reuse import finished_trainings, take_over
 from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_algo.training.train import usable_device
 from tcmrl_data import TrainingError
@@ -75,6 +76,8 @@ def run_experiment(
     steps: int | None = None,
     workers: int | None = None,
     device: str = "cpu",
+    tuned: TunedSettings | None = None,
+    reuse: Sequence[str | Path] = (),
     report: Callable[[EndedRun], None] = ignore,
 ) -> ExperimentReport:
     """Runs an experiment, without the runs that are finished; checks all of it before the first run starts.
@@ -91,6 +94,9 @@ def run_experiment(
             whether or not there are so many runs; a run that was begun keeps the threads that it had, on
             which its last bits depend.
         device: a torch device, for runs that are not begun yet.
+        tuned: settings by environment and algorithm, as `tuned_settings` reads them.
+        reuse: other results folders, whose finished trainings are taken over where they are the same, so
+            that only what was not evaluated there is done.
         report: called as runs end.
 
     Raises:
@@ -103,7 +109,13 @@ def run_experiment(
     began, out, cores = time.perf_counter(), Path(out), len(os.sched_getaffinity(0))
     usable_device(device)
     every = plan_runs(
-        experiment, data=Path(data), views=out / "folds", environments=environments, seeds=seeds, steps=steps
+        experiment,
+        data=Path(data),
+        views=out / "folds",
+        environments=environments,
+        seeds=seeds,
+        steps=steps,
+        tuned=tuned,
     )
     before = _finished(every, out, experiment)
     plan = _chosen(every, experiment, only)
@@ -116,9 +128,11 @@ def run_experiment(
         if found[run.id] is None
     }
     make_folders(out)
+    trained = finished_trainings(reuse)
     failed: list[str] = []
     with lock_file(out / ".lock", f"experiment {out}"):
         write_record(out / "experiment.json", experiment)
+        jobs = {name: take_over(job, trained) for name, job in jobs.items()}
         for job in jobs.values():
             write_record(Path(job.folder) / "job.json", job)
             error_file(Path(job.folder)).unlink(missing_ok=True)
@@ -176,11 +190,11 @@ def _job(run: PlannedRun, experiment: Experiment, out: Path, *, threads: int, de
     Raises:
         CheckpointError: it was begun with other settings or data.
     """
-    folder = (out / "runs" / run.id).resolve()
+    folder, shared = (out / "runs" / run.id).resolve(), None
     if (folder / "run.json").is_file() and (folder / "job.json").is_file():
         before = read_record(Job, folder / "job.json")
         check_same(before.identity, run.identity(), place=folder)
-        threads, device = before.config.settings.run.threads, before.device
+        threads, device, shared = before.config.settings.run.threads, before.device, before.shared
     settings = run.config.settings
     bounded = settings.model_copy(update={"run": settings.run.model_copy(update={"threads": threads})})
     return Job(
@@ -198,6 +212,8 @@ def _job(run: PlannedRun, experiment: Experiment, out: Path, *, threads: int, de
         device=device,
         protocols=experiment.protocols,
         curve_points=experiment.curve_points,
+        tuned=run.tuned,
+        shared=shared,
     )
 
 

@@ -11,6 +11,7 @@ from tcmrl_algo.reporting import figures, sections
 from tcmrl_algo.reporting.claims import Verdict, judge
 from tcmrl_algo.reporting.contexts import embed
 from tcmrl_algo.reporting.measuring import Contexts, Measured
+from tcmrl_algo.reporting.scores import SCORES, known_scores
 from tcmrl_algo.reporting.tables import Table
 
 NOTE = """\
@@ -22,8 +23,9 @@ five seeds contains the true mean in about 84% of cases. With folds, every task 
 task once, and the interval is over all pairs of seed and fold: it covers training on these splits, not \
 tasks beyond the dataset. `other context` is the \
 return of the same policy with the contexts of other tasks; the regret is the oracle's return minus the \
-policy's; the normalized score is 0 for uniform actions and 1 for the oracle or, without one, for the best \
-behavior policy. A `(privileged)` method is a control that observes the task parameters."""
+policy's; `best fixed` is the return of the best policy that acts the same in all tasks, fitted on the \
+training tasks; the normalized score is 0 for uniform actions and 1 for the oracle or, without one, for the \
+best behavior policy. A `(privileged)` method is a control that observes the task parameters."""
 CLAIMS = """\
 Differences are taken run by run (same seed, same fold), and positive differences support the claim, which \
 is judged under every protocol that it concerns. The 95% interval of the mean difference is by Student's t, \
@@ -37,6 +39,9 @@ random, the protocol was run several times (`repeats` in the JSON documents), an
 BESIDE = """\
 The paper has other data, another split of tasks, other training and its own protocol: the columns have \
 the same unit, but are not comparable otherwise."""
+TUNING = """\
+Settings by which all methods of an algorithm were trained, where a method does not set another value; the \
+score is the mean normalized return on held-out training tasks. Test tasks had no part in it."""
 COSTS = """\
 Training time excludes evaluation; evaluation time covers all points of the learning curve and all \
 protocols. Memory is that of the process or, on CUDA, of the tensors on the device. Runs that shared a \
@@ -53,6 +58,17 @@ ratios of the rows."""
 Draw = Callable[[Path], None]
 
 
+@dataclass(frozen=True)
+class Picture:
+    """A figure's place in a report: the name of its file, and what it shows."""
+
+    file: str
+    caption: str
+
+
+Block = str | Table | Picture
+
+
 @final
 @dataclass
 class Page:
@@ -60,24 +76,24 @@ class Page:
 
     Attributes:
         out: folder of the report; a figure that needs checkpoints is kept if it is there.
-        lines: paragraphs and headings.
+        blocks: paragraphs, headings, tables and figures in their order.
         tables: by file name; one CSV file each.
         figures: file names, with what draws them; None if an earlier report drew them.
     """
 
     out: Path
-    lines: list[str] = field(default_factory=list)
+    blocks: list[Block] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
     figures: dict[str, Draw | None] = field(default_factory=dict)
     roots: set[str] = field(default_factory=set)
 
     def text(self, line: str) -> None:
         """Adds a paragraph or a heading."""
-        self.lines.append(line)
+        self.blocks.append(line)
 
     def table(self, table: Table) -> None:
         """Adds a table, and its CSV file."""
-        self.text(table.markdown())
+        self.blocks.append(table)
         self.data(table)
 
     def data(self, table: Table) -> None:
@@ -88,7 +104,7 @@ class Page:
         """Adds a figure; without `draw`, the one of an earlier report, if there is one."""
         file = f"{name}.png"
         if draw is not None or (self.out / file).is_file():
-            self.text(f"![{caption}]({file})")
+            self.blocks.append(Picture(file, caption))
             self.figures[file] = draw
 
 
@@ -100,7 +116,7 @@ def compose(measured: Sequence[tuple[str, Measured]], out: Path) -> tuple[Page, 
         out: folder of the report.
     """
     page = Page(out)
-    page.text("# Report")
+    page.text(f"# Report: {', '.join(name for name, _ in measured)}")
     page.text(NOTE)
     judged = {name: judge(found.source) for name, found in measured}
     if len(judged) > 1 and any(judged.values()):
@@ -133,7 +149,11 @@ def _add_environment(page: Page, name: str, environment: str, found: Measured) -
     results = found.source.results(environment)
     page.text(f"### {environment}")
     page.table(sections.setup_table(f"{name}-setup", results))
-    page.table(sections.final_table(f"{name}-returns", results))
+    kept = found.source.datasets.get(environment)
+    stored = None if kept is None else kept.test_return
+    page.table(sections.final_table(f"{name}-returns", results, stored=stored))
+    if known_scores(results, stored):
+        page.text(SCORES)
     page.figure(
         f"{name}-returns", "final returns", lambda file: figures.draw_finals(file, environment, results)
     )
@@ -159,6 +179,11 @@ def _add_environment(page: Page, name: str, environment: str, found: Measured) -
         page.text("#### Time and memory")
         page.text(COSTS)
         page.table(costs)
+    tuning = sections.tuning_table(f"{name}-tuning", results)
+    if tuning is not None:
+        page.text("#### Tuning")
+        page.text(TUNING)
+        page.table(tuning)
     if environment in found.unmeasured:
         reason = found.unmeasured[environment]
         page.text(f"Contexts, attention and the dataset's returns are omitted: {reason}.")

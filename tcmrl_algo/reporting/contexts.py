@@ -93,11 +93,15 @@ class TrainedContexts:
 
     @cached_property
     def contexts(self) -> FloatArray | None:
-        """Contexts, (trajectories, latent); None for a method without contexts."""
+        """Contexts, (trajectories, latent); None if all are equal, or for a method without contexts.
+
+        All are equal where an encoder has collapsed, and where the context is not of trajectories, as the
+        privileged control's.
+        """
         if not isinstance(self._algorithm, ContextAlgorithm):
             return None
         found: FloatArray = self._algorithm.context(self._stored.lanes).cpu().numpy()
-        return found if found.shape[1] else None
+        return found if np.ptp(found, axis=0).any() else None
 
     @cached_property
     def weights(self) -> TransitionWeights | None:

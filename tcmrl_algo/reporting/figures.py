@@ -57,6 +57,34 @@ def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
     figure.savefig(file, dpi=130)
 
 
+def draw_boards(file: Path, boards: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> None:
+    """Mean returns with intervals, a panel per dataset, a line per method and a color per protocol.
+
+    Args:
+        file: the PNG file.
+        boards: returns of the runs by title, protocol and method.
+    """
+    most = max(len({method for found in board.values() for method in found}) for board in boards.values())
+    figure, panels = _panels(len(boards), height=max(HEIGHT, 0.35 * most + 1.0))
+    for axes, (title, board) in zip(panels, boards.items(), strict=True):
+        methods = list(dict.fromkeys(method for found in board.values() for method in found))[::-1]
+        for index, (protocol, found) in enumerate(board.items()):
+            color, shift = f"C{index % 10}", 0.6 * (0.5 - (index + 0.5) / len(board))
+            for method, finals in found.items():
+                summary, place = summarize(finals), methods.index(method) + shift
+                axes.plot(summary.mean, place, "o", color=color, markersize=4)
+                low, high = summary.low, summary.high
+                if low is None or high is None:
+                    low, high = min(finals), max(finals)
+                axes.hlines(place, low, high, color=color, linewidth=1.2)
+            axes.plot([], [], "o-", color=color, label=protocol, markersize=4)
+        axes.set_yticks(range(len(methods)), methods, fontsize="small")
+        axes.set_xlabel("return on test tasks")
+        axes.set_title(title, fontsize="small")
+        axes.legend(fontsize="x-small")
+    figure.savefig(file, dpi=130)
+
+
 def draw_adaptation(file: Path, title: str, results: Sequence[RunResult]) -> None:
     """Return of the first, second, … adaptation episode, means over tasks and runs; a panel per protocol."""
     protocols = list(results[0].evaluations)
@@ -106,13 +134,13 @@ def draw_attention(file: Path, weights: Mapping[str, TransitionWeights]) -> None
     figure.savefig(file, dpi=130)
 
 
-def _panels(count: int, *, width: float = WIDTH) -> "tuple[Figure, list[Axes]]":
+def _panels(count: int, *, width: float = WIDTH, height: float = HEIGHT) -> "tuple[Figure, list[Axes]]":
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     columns = min(count, 3)
     rows = -(-count // columns)
-    figure = Figure(figsize=(columns * width, rows * HEIGHT), layout="constrained")
+    figure = Figure(figsize=(columns * width, rows * height), layout="constrained")
     FigureCanvasAgg(figure)
     grid = list(np.ravel(figure.subplots(rows, columns, squeeze=False)))
     for unused in grid[count:]:

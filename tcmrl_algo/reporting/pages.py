@@ -9,11 +9,12 @@ is one number, with as many decimals as stand there, and
     <!-- returns figure4_point_robot -->
     <!-- end -->
 
-is a whole table. Folders are those of reports below one root, such as `docs/results`. The keys of a number
-are folder, environment, protocol, method and a quantity (`final`, `shuffled`, `regret`, `normalized`, and
-`low` or `high`, the ends of the 95% interval of `final`); or folder, environment, protocol, `claim N` and one
-of `mean`, `low`, `high`, `p` (N counts the claims of the experiment from 1); or a JSON file and the keys into
-it, and last, if needed, a factor such as `* 1000`.
+is a whole table; `<!-- worth FOLDER -->` is that of the documents of `inspect worth --json` in a folder
+beside all reports. Folders are those of reports below one root, such as `docs/results`. The keys of a
+number are folder, environment, protocol, method and a quantity (`final`, `shuffled`, `regret`,
+`normalized`, `fixed`, and `low` or `high`, the ends of the 95% interval of `final`); or folder,
+environment, protocol, `claim N` and one of `mean`, `low`, `high`, `p` (N counts the claims of the
+experiment from 1); or a JSON file and the keys into it, and last, if needed, a factor such as `* 1000`.
 """
 
 import re
@@ -27,7 +28,8 @@ from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.reporting import sections
 from tcmrl_algo.reporting.claims import Verdict, judge
 from tcmrl_algo.reporting.sources import Source, read_sources
-from tcmrl_data import TrainingError, parse_json
+from tcmrl_algo.reporting.worth import worth_table
+from tcmrl_data import TrainingError, Worth, parse_json
 
 NUMBER = re.compile(r"(?P<shown>[-−+]?\d[\d,]*(?:\.\d+)?)<!-- = (?P<key>[^>]*?) -->")
 BLOCK = re.compile(r"<!-- (?P<kind>\w+) (?P<folder>\S+) -->\n(?P<shown>.*?)<!-- end -->", re.DOTALL)
@@ -60,6 +62,16 @@ class Pages:
         blocks = BLOCK.sub(self._block, text)
         return NUMBER.sub(lambda match: _number(match, self), blocks)
 
+    def worths(self, folder: str) -> dict[str, Worth]:
+        """The documents of `tcmrl-data inspect worth --json` in a folder, by name."""
+        files = sorted((self._root / folder).glob("*.json"))
+        return {file.stem: Worth.model_validate_json(file.read_bytes()) for file in files}
+
+    def reports(self) -> list[tuple[str, Source]]:
+        """All reports with their folders' names."""
+        folders = sorted(file.parent.name for file in self._root.glob("*/report.md"))
+        return [(folder, self.source(folder)) for folder in folders]
+
     def _block(self, match: "re.Match[str]") -> str:
         kind, folder = match["kind"], match["folder"]
         if kind not in self._blocks:
@@ -91,7 +103,9 @@ def unmarked_numbers(text: str) -> list[str]:
 def _returns(pages: Pages, folder: str) -> str:
     parts, source = [], pages.source(folder)
     for environment in source.environments():
-        table = sections.final_table("returns", source.results(environment))
+        kept = source.datasets.get(environment)
+        stored = None if kept is None else kept.test_return
+        table = sections.final_table("returns", source.results(environment), stored=stored)
         parts.append(f"On {environment}:\n\n{table.markdown()}")
     return "\n" + "\n\n".join(parts) + "\n"
 
@@ -100,8 +114,12 @@ def _claims(pages: Pages, folder: str) -> str:
     return f"\n{sections.verdict_table('claims', judge(pages.source(folder))).markdown()}\n"
 
 
+def _worth(pages: Pages, folder: str) -> str:
+    return f"\n{worth_table(pages.worths(folder), pages.reports()).markdown()}\n"
+
+
 Block = Callable[[Pages, str], str]
-BLOCKS: dict[str, Block] = {"returns": _returns, "claims": _claims}
+BLOCKS: dict[str, Block] = {"returns": _returns, "claims": _claims, "worth": _worth}
 """What a table mark may ask for."""
 
 

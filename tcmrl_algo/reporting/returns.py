@@ -43,6 +43,11 @@ class DatasetReturns(BaseModel):
     test_tasks: int
     snapshots: tuple[SnapshotReturns, ...]
 
+    @property
+    def test_return(self) -> float | None:
+        """Mean return of all stored episodes of the test tasks."""
+        return self.snapshots[-1].test if self.snapshots else None
+
 
 def dataset_returns(dataset: Dataset) -> DatasetReturns:
     """Mean returns of the stored episodes of a dataset, over tasks, by snapshot."""

@@ -8,24 +8,42 @@ from typing import Any
 from tcmrl_algo.experiment.results import RunResult, by_method, coverage
 from tcmrl_algo.reporting.claims import Verdict
 from tcmrl_algo.reporting.returns import DatasetReturns
+from tcmrl_algo.reporting.scores import known_scores
 from tcmrl_algo.reporting.tables import Cell, Table, across_seeds, interval_text
 
 PAPER_COSTS = ("paper: training s", "paper: MB")
 PAPER_ATTENTION = ("paper: mean", "paper: median")
-PARTS = ("final", "shuffled", "regret", "normalized")
+IDAQ = ("IDAQ", "idaq_literal")
+"""IDAQ trains as FOCAL does, and adapts by this protocol."""
+PARTS = ("final", "shuffled", "regret", "normalized", "fixed")
 
 
-def final_table(name: str, results: Sequence[RunResult]) -> Table:
-    """Return, return with the contexts of other tasks, regret and normalized score by protocol and method."""
+def final_table(name: str, results: Sequence[RunResult], *, stored: float | None = None) -> Table:
+    """Returns, regrets and normalized scores by protocol and method, beside two controls.
+
+    They are the method's own return with the contexts of other tasks, and that of the best fixed policy.
+    Success rate and return over the dataset's have columns where they are known.
+
+    Args:
+        name: of the CSV file.
+        results: of the runs in one environment.
+        stored: mean return of the stored episodes of the test tasks.
+    """
     rows: list[tuple[Cell, ...]] = []
+    scores = known_scores(results, stored)
     for protocol in results[0].evaluations:
         for method, runs in by_method(results).items():
-            values = {part: [run.evaluations[protocol][f"mean_{part}"] for run in runs] for part in PARTS}
-            others = (across_seeds(values[part])[0] for part in PARTS[1:])
+            found = [run.evaluations[protocol] for run in runs]
+            values = {part: [evaluation.get(f"mean_{part}") for evaluation in found] for part in PARTS}
+            others = [across_seeds(values[part])[0] for part in PARTS[1:]]
+            others += [
+                across_seeds([score(evaluation) for evaluation in found])[0] for score in scores.values()
+            ]
             row = (protocol, method, len(runs), *across_seeds(values["final"]), *others)
             rows.append((*row, coverage(runs)))
     columns = ("protocol", "method", "runs", "return", "IQM", "95% interval", "other context")
-    return Table(name, (*columns, "regret", "normalized", "interval covers"), tuple(rows))
+    more = ("regret", "normalized", "best fixed", *scores, "interval covers")
+    return Table(name, (*columns, *more), tuple(rows))
 
 
 def curve_table(name: str, results: Sequence[RunResult]) -> Table:
@@ -80,7 +98,8 @@ def published_table(name: str, environment: str, results: Sequence[RunResult]) -
     for method in dict.fromkeys((*scores, *ours)):
         cells: list[Cell] = []
         for protocol in protocols:
-            finals = [run.evaluations[protocol]["mean_final"] for run in ours.get(method, [])]
+            trained = "FOCAL" if (method, protocol) == IDAQ and method not in ours else method
+            finals = [run.evaluations[protocol]["mean_final"] for run in ours.get(trained, [])]
             cells += across_seeds(finals)[::2]
         rows.append((method, _plus_minus(scores.get(method)), *cells))
     columns = [f"ours, {protocol}{part}" for protocol in protocols for part in ("", ": 95% interval")]
@@ -155,6 +174,18 @@ def setup_table(name: str, results: Sequence[RunResult]) -> Table:
     }
     rows = tuple((key, ", ".join(dict.fromkeys(map(str, found)))) for key, found in values.items())
     return Table(name, ("property", "value"), rows)
+
+
+def tuning_table(name: str, results: Sequence[RunResult]) -> Table | None:
+    """Tuned settings by algorithm, and what it took to find them; None if nothing was tuned."""
+    rows: dict[str, tuple[Cell, ...]] = {}
+    for result in results:
+        if (tuned := result.tuned) is not None:
+            seeds = ", ".join(map(str, tuned.seeds))
+            effort = (tuned.environment, tuned.root[:12], tuned.trials, tuned.steps, seeds)
+            rows[result.algorithm] = (result.algorithm, *effort, tuned.score, " ".join(tuned.overrides))
+    columns = ("algorithm", "tuned on", "root", "trials", "steps", "seeds", "best score", "settings")
+    return Table(name, columns, tuple(rows.values())) if rows else None
 
 
 def digest_table(name: str, results: Sequence[RunResult]) -> Table:

@@ -8,11 +8,11 @@ from pathlib import Path
 
 from tcmrl_algo.adaptation.evaluate import evaluate_run
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
-from tcmrl_algo.experiment.config import Experiment, read_experiment, run_id
+from tcmrl_algo.experiment.config import Experiment, experiment_of, read_experiment, run_id
 from tcmrl_algo.experiment.results import AGAIN, RunResult, error_file, read_results, result_file
 from tcmrl_algo.reporting.returns import DatasetReturns
 from tcmrl_algo.training.checkpoint import Run, open_run, tensors_digest
-from tcmrl_data import CheckpointError, TrainingError, canonical_json, open_dataset, parse_json
+from tcmrl_data import CheckpointError, canonical_json, open_dataset
 from tcmrl_data.foundation.records import read_record
 
 
@@ -122,14 +122,7 @@ def _relocated(result: RunResult, places: Mapping[str, str]) -> RunResult:
 
 
 def _results_folder(path: Path, places: Mapping[str, str]) -> Source:
-    file = path / "experiment.json"
-    try:
-        tables = parse_json(file.read_bytes())
-    except ValueError as error:
-        raise CheckpointError(f"{file}: {error}; run `tcmrl experiment` again to rewrite the file") from None
-    if not isinstance(tables, dict):
-        raise TrainingError(f"{file} is not an experiment; run `tcmrl experiment` again to rewrite the file")
-    experiment = read_experiment(tables, place=str(file))
+    experiment = experiment_of(path)
     found = [
         FinishedRun(
             _relocated(result, places),

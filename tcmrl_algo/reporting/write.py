@@ -1,4 +1,4 @@
-"""Writes a report: Markdown, CSV and PNG files, and the compact results from which it can be made again."""
+"""Writes a report: Markdown, HTML, CSV and PNG, and the compact results from which it can be made again."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -9,9 +9,11 @@ from tcmrl_algo.experiment.compact import write_compact
 from tcmrl_algo.experiment.config import folder_name, run_id
 from tcmrl_algo.experiment.results import error_file
 from tcmrl_algo.reporting.claims import Verdict
-from tcmrl_algo.reporting.compose import Page, compose
+from tcmrl_algo.reporting.compose import Block, Page, Picture, compose
+from tcmrl_algo.reporting.html import page_html
 from tcmrl_algo.reporting.measuring import Measured, measure_source
 from tcmrl_algo.reporting.sources import natural_order, read_sources
+from tcmrl_algo.reporting.tables import Table
 from tcmrl_data.foundation.disk import make_folders, replace_file
 from tcmrl_data.foundation.records import write_record
 
@@ -77,7 +79,8 @@ def write_report(
     for table in page.tables:
         replace_file(out / f"{table.name}.csv", table.csv().encode())
     replace_file(out / "report.md", page_text(page).encode())
-    names = ["report.md", *(f"{table.name}.csv" for table in page.tables), *page.figures]
+    replace_file(out / "report.html", page_html(page).encode())
+    names = ["report.md", "report.html", *(f"{table.name}.csv" for table in page.tables), *page.figures]
     verdicts = tuple(itertools.chain.from_iterable(judged.values()))
     return WrittenReport(out / "report.md", (*(out / name for name in names), *records), verdicts)
 
@@ -106,7 +109,13 @@ def measure_paths(
 
 def page_text(page: Page) -> str:
     """The content of `report.md`."""
-    return "\n\n".join(page.lines) + "\n"
+    return "\n\n".join(map(_markdown, page.blocks)) + "\n"
+
+
+def _markdown(block: Block) -> str:
+    if isinstance(block, Picture):
+        return f"![{block.caption}]({block.file})"
+    return block.markdown() if isinstance(block, Table) else block
 
 
 def _write_records(folder: Path, found: Measured) -> list[Path]:

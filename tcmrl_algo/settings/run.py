@@ -8,6 +8,23 @@ PROTOCOL_GROUP = "tcmrl.protocols"
 """The entry point group of protocols, which live in a room above this one."""
 
 
+EVALUATION_KEYS = frozenset(
+    {
+        "protocol",
+        "episodes",
+        "random_episodes",
+        "candidates",
+        "repeats",
+        "offline_trajectories",
+        "final_episodes",
+    }
+)
+"""Settings of `RunSettings` that only evaluation reads."""
+
+LOGGING_KEYS = frozenset({"log_every", "checkpoint_every"})
+"""Settings of `RunSettings` that change no tensor."""
+
+
 class RunSettings(BaseModel):
     """The `[training.run]` table.
 

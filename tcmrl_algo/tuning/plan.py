@@ -80,7 +80,6 @@ def plan_tuning(
         algorithm=algorithm,
         environment=dataset.name,
         profile=profile,
-        dataset=str(dataset.path.resolve()),
         root=dataset.manifest.root,
         seed=seed,
         seeds=tuple(seeds),

@@ -70,7 +70,7 @@ class Tuning(_Record):
 
     Attributes:
         algorithm, environment, profile: what was tuned, from whose training table.
-        dataset, root: the dataset and its root; its test tasks were not used.
+        root: of the dataset; its test tasks were not used.
         seed: of the proposals.
         seeds: every trial was trained with each.
         steps: of training.
@@ -87,7 +87,6 @@ class Tuning(_Record):
     algorithm: str
     environment: str
     profile: Profile
-    dataset: str
     root: str
     seed: int
     seeds: tuple[int, ...]

@@ -25,6 +25,14 @@ WORK_FILES = {LOCK, EVENTS, EARLIER_EVENTS, ASSEMBLY}
 
 TABLES = {TASKS, PARTS_TABLE}
 
+CARD = "README.md"
+CROISSANT = "croissant.json"
+CROISSANT_PARTS = "croissant-parts.jsonl"
+CROISSANT_TASKS = "croissant-tasks.jsonl"
+CROISSANT_FILES = {CROISSANT, CROISSANT_PARTS, CROISSANT_TASKS}
+DESCRIPTIONS = {CARD} | CROISSANT_FILES
+"""Files that may lie beside the data and say nothing that the data do not say."""
+
 
 def check_work_files(folder: Path, *, but: Collection[str] = ()) -> None:
     """Refuses a dataset whose work files, or anything in its work folders, would lead writing out of it.

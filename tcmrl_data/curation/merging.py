@@ -11,6 +11,7 @@ from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.recipe.about import merged_about
 from tcmrl_data.store.keys import MAIN_RUN, RUN_NAME, PartKey
 from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part_table import PartEntry
@@ -73,7 +74,12 @@ class _MergedRun:
         )
         steps = runs[0].steps if len({run.steps for run in runs}) == 1 else None
         sources = sorted({pair for run in runs for pair in run.sources})
-        return runs[0].model_copy(update={"name": name, "steps": steps, "sources": tuple(sources)})
+        recipe = runs[0].recipe
+        if recipe is not None:
+            abouts = [run.recipe.about for run in runs if run.recipe is not None]
+            recipe = recipe.model_copy(update={"about": merged_about(abouts)})
+        changes = {"name": name, "steps": steps, "sources": tuple(sources), "recipe": recipe}
+        return runs[0].model_copy(update=changes)
 
 
 def plan_merge(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.picture import check_picture, new_figure, save_figure
 from tcmrl_data.dataset.shift import shift_rows
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import SelectionError
@@ -18,7 +19,6 @@ from tcmrl_data.store.part_table import PartEntry
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-PLOT_FORMATS = (".pdf", ".png", ".svg")
 SPLITS = ("train", "test")
 RETURN_FIELDS = ("episodes", "steps", "mean", "std", "min", "max", "success_rate")
 
@@ -168,17 +168,12 @@ def plot_returns(dataset: Dataset, table: dict[str, Any], file: Path) -> None:
         file: the picture to write; its ending names the format.
 
     Raises:
-        SelectionError: the ending names no supported format, or the dataset has no parts.
+        SelectionError: the file's name is none of a picture, or the dataset has no parts.
     """
-    if file.suffix.lower() not in PLOT_FORMATS:
-        raise SelectionError(f"--plot {file}: the name must end in {', '.join(PLOT_FORMATS)}")
+    check_picture(file)
     if not any(task["snapshots"] for task in table["tasks"]):
         raise SelectionError(f"{dataset.folder} has no parts to plot; build it with `tcmrl-data build`")
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 4.2), layout="constrained")
-    FigureCanvasAgg(figure)
+    figure = new_figure(7.0, 4.2)
     axes = figure.subplots()
     for split, color in zip(SPLITS, ("tab:blue", "tab:orange"), strict=True):
         _draw_split(axes, table, split, color)
@@ -187,7 +182,7 @@ def plot_returns(dataset: Dataset, table: dict[str, Any], file: Path) -> None:
     axes.set_title(f"{dataset.name}: behavior policies of {len(table['tasks'])} tasks")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
-    figure.savefig(file, dpi=130)
+    save_figure(figure, file)
 
 
 def _draw_split(axes: "Axes", table: dict[str, Any], split: str, color: str) -> None:

@@ -8,6 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from tcmrl_data.envs._simulation_camera import SimulationCamera, Viewpoint
 from tcmrl_data.envs.trajectory import FloatArray
 
 
@@ -45,6 +46,22 @@ class SimulatedTask(gymnasium.Env[FloatArray, FloatArray]):
 
     def close(self) -> None:
         self._simulator.close()
+
+    def camera(self, viewpoint: str | Viewpoint, *, width: int, height: int) -> SimulationCamera:
+        """A camera in the simulated world.
+
+        Args:
+            viewpoint: name of one of the model's cameras, or a place.
+            width: of the pictures in pixels.
+            height: of the pictures in pixels.
+
+        Raises:
+            RenderingError: no OpenGL works on this machine.
+        """
+        simulator: Any = self._simulator
+        return SimulationCamera(
+            simulator.model, simulator.data, width=width, height=height, viewpoint=viewpoint
+        )
 
     def observe(self, observation: FloatArray) -> FloatArray:
         """The task's observation for the simulator's observation, both (observation_dim,)."""

@@ -6,17 +6,21 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources.abc import Traversable
-from typing import Any, ClassVar, Literal, final
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import gymnasium
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
+from tcmrl_data.envs.camera import Camera
 from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
-from tcmrl_data.foundation.errors import RecipeError
+from tcmrl_data.foundation.errors import RecipeError, RenderingError
 from tcmrl_data.foundation.plugins import Registry, unknown_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 Parameters = Mapping[str, Any]
 """JSON values that define one task."""
@@ -120,6 +124,8 @@ class Environment(abc.ABC):
     """Dtypes of further per-step arrays, by name."""
     ordering_name: ClassVar[str | None] = None
     """What `ordering` measures, with its unit; None where tasks have no order."""
+    plane: ClassVar[tuple[str, str] | None] = None
+    """Names of the first two columns of observations where they are a place in the plane; None elsewhere."""
     simulator_bytes: ClassVar[int] = 0
     """Measured memory of one simulated task; 0 for tasks without a simulator."""
 
@@ -177,7 +183,7 @@ class Environment(abc.ABC):
 
     def lanes(self, parameters: Sequence[Parameters], *, reward: Reward = "stored") -> Lanes:
         """Lanes with the full view, one per entry of `parameters`; `reward` as for `make`."""
-        return EnvironmentLanes(self, parameters, reward)
+        return EnvironmentLanes(self, [self.make(task, view="full", reward=reward) for task in parameters])
 
     def stored_view(self, observations: FloatArray) -> FloatArray:
         """The stored view of full observations (..., observation_dim)."""
@@ -196,6 +202,38 @@ class Environment(abc.ABC):
         """
         return None
 
+    def camera(
+        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
+    ) -> Camera | None:
+        """A camera that takes pictures of a task; None if the environment has no picture.
+
+        Args:
+            task: what `make` made, with the full view; it plays an episode while pictures are taken.
+            parameters: the task's.
+            width: of the pictures in pixels.
+            height: of the pictures in pixels.
+
+        Raises:
+            RenderingError: this machine cannot draw it.
+        """
+        return None
+
+    def draw_path(
+        self, axes: "Axes", parameters: Parameters, observations: FloatArray, *, color: str
+    ) -> None:
+        """Draws a task and the path of an episode in it, where observations are places in a plane.
+
+        Args:
+            axes: matplotlib's, where other tasks may be drawn too.
+            parameters: the task's.
+            observations: (T + 1, observation_dim), stored view.
+            color: of the task, as matplotlib names it.
+
+        Raises:
+            RenderingError: the environment has no such plane, which is the default.
+        """
+        raise RenderingError(f"paths of {self.name} cannot be drawn, since its observations are no places")
+
     def fingerprint(self) -> dict[str, Any]:
         """Library versions, time step, model hash and anything else that the dynamics depend on; JSON."""
         return {}
@@ -203,12 +241,17 @@ class Environment(abc.ABC):
 
 @final
 class EnvironmentLanes(Lanes):
-    """Lanes that step Gymnasium environments one after another."""
+    """Lanes that step Gymnasium environments one after another.
 
-    def __init__(self, environment: Environment, parameters: Sequence[Parameters], reward: Reward) -> None:
-        self.num_lanes = len(parameters)
+    Args:
+        environment: the family of the tasks.
+        tasks: one per lane, made with the full view.
+    """
+
+    def __init__(self, environment: Environment, tasks: Sequence[gymnasium.Env[Any, Any]]) -> None:
+        self.num_lanes = len(tasks)
         self._extras = environment.extras
-        self._environments = [environment.make(task, view="full", reward=reward) for task in parameters]
+        self._environments = list(tasks)
         self._observations = np.zeros((self.num_lanes, environment.observation_dim))
 
     def reset(self, seeds: Sequence[int]) -> FloatArray:

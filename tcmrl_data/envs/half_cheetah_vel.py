@@ -8,11 +8,13 @@ position.
 
 from typing import Any, final
 
+import gymnasium
 import numpy as np
 from pydantic import Field, model_validator
 
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint, squared_norm
 from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
+from tcmrl_data.envs.camera import Camera
 from tcmrl_data.envs.controller import View
 from tcmrl_data.envs.trajectory import FloatArray
 
@@ -63,6 +65,12 @@ class HalfCheetahVel(Environment):
         self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> "HalfCheetahVelTask":
         return HalfCheetahVelTask(float(parameters["velocity"]), self.settings)
+
+    def camera(
+        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
+    ) -> Camera:
+        assert isinstance(task, HalfCheetahVelTask)
+        return task.camera("track", width=width, height=height)
 
     def fingerprint(self) -> dict[str, Any]:
         simulator = _simulator()

@@ -17,13 +17,17 @@ import numpy as np
 from pydantic import Field
 
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint
+from tcmrl_data.envs._simulation_camera import Viewpoint
 from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
+from tcmrl_data.envs.camera import Camera
 from tcmrl_data.envs.controller import Controller, View
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import TaskError
 
 GOAL = slice(-3, None)
 TASKS_PER_SET = 50
+VIEWPOINT = Viewpoint(look_at=(0.0, 0.68, 0.14), distance=1.35, azimuth=225.0, elevation=-25.0)
+"""In front of the table; Meta-World's own cameras stand upside down."""
 TASK_SETS = (
     "assembly", "basketball", "bin-picking", "box-close", "button-press", "button-press-topdown",
     "button-press-topdown-wall", "button-press-wall", "coffee-button", "coffee-pull", "coffee-push",
@@ -56,6 +60,7 @@ class MetaWorldML1(Environment):
     Settings = MetaWorldML1Settings
     observation_dim = 39
     action_dim = 4
+    plane = ("hand, x in m", "hand, y in m")
     simulator_bytes = 24 * 2**20
     extras: ClassVar = {"success": np.bool_}
 
@@ -90,6 +95,12 @@ class MetaWorldML1(Environment):
 
     def scripted(self, parameters: Sequence[Parameters], noise: float) -> "ExpertController":
         return ExpertController([task["env_name"] for task in parameters], noise)
+
+    def camera(
+        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
+    ) -> Camera:
+        assert isinstance(task, MetaWorldML1Task)
+        return task.camera(VIEWPOINT, width=width, height=height)
 
     def fingerprint(self) -> dict[str, Any]:
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS

@@ -6,7 +6,7 @@ action moves it by at most 0.1 per axis.
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal, final
+from typing import TYPE_CHECKING, Any, Literal, final
 
 import gymnasium
 import numpy as np
@@ -22,8 +22,13 @@ from tcmrl_data.envs.base import (
     Parameters,
     Reward,
 )
+from tcmrl_data.envs.camera import Camera
 from tcmrl_data.envs.controller import Controller, View
+from tcmrl_data.envs.point_robot_camera import PointRobotCamera, draw_task
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 STEP_SIZE = 0.1
 
@@ -60,6 +65,7 @@ class _PointRobot(Environment):
     Settings = PointRobotSettings
     observation_dim = 2
     action_dim = 2
+    plane = ("x", "y")
     settings: PointRobotSettings
 
     def rewards(self, distances: FloatArray, reward: Reward) -> FloatArray:
@@ -77,6 +83,23 @@ class _PointRobot(Environment):
 
     def lanes(self, parameters: Sequence[Parameters], *, reward: Reward = "stored") -> "PointRobotLanes":
         return PointRobotLanes(self, parameters, reward)
+
+    def camera(
+        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
+    ) -> Camera:
+        return PointRobotCamera(parameters, reward_radius=self._reward_radius, width=width, height=height)
+
+    def draw_path(
+        self, axes: "Axes", parameters: Parameters, observations: FloatArray, *, color: str
+    ) -> None:
+        draw_task(axes, parameters, reward_radius=self._reward_radius, color=color)
+        axes.plot(observations[:, 0], observations[:, 1], ".-", color=color, markersize=3, linewidth=1)
+        axes.set_aspect("equal")
+
+    @property
+    def _reward_radius(self) -> float | None:
+        """Distance to the goal within which there is a reward; None if there is one everywhere."""
+        return self.settings.goal_radius if self.settings.reward_density == "sparse" else None
 
     def oracle(self, parameters: Sequence[Parameters]) -> "GreedyController":
         return GreedyController(*goals_and_winds(parameters))

@@ -17,11 +17,13 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, final
 
+import gymnasium
 import numpy as np
 from pydantic import Field
 
 from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint, squared_norm
 from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
+from tcmrl_data.envs.camera import Camera
 from tcmrl_data.envs.controller import View
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import TaskError
@@ -96,6 +98,12 @@ class _RandParams(Environment):
             import mujoco
 
             mujoco.mj_setConst(simulator.model, simulator.data)
+
+    def camera(
+        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
+    ) -> Camera:
+        assert isinstance(task, RandParamsTask)
+        return task.camera("track", width=width, height=height)
 
     def fingerprint(self) -> dict[str, Any]:
         simulator = self.simulator()

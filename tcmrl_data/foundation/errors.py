@@ -21,6 +21,10 @@ class SimulationError(TcmrlError):
     """An environment that cannot be simulated."""
 
 
+class RenderingError(TcmrlError):
+    """An episode that cannot be drawn: no OpenGL, no camera, or a file of a kind that is not written."""
+
+
 class TaskError(TcmrlError):
     """A task index that does not exist, or a task list that cannot be read."""
 

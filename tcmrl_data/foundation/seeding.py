@@ -32,6 +32,9 @@ class Purpose(enum.IntEnum):
     EVALUATION_CANDIDATES = 17
     CONTROL_RESET = 18
     TUNING = 19
+    TRANSFER_RESET = 20
+    TRANSFER_NOISE = 21
+    VISIBILITY = 22
 
 
 def environment_key(environment: str) -> int:

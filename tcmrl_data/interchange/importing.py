@@ -18,7 +18,7 @@ from tcmrl_data.interchange.optional import require_packages
 from tcmrl_data.interchange.readers.base import READERS, Reader, ReadPart, Say, say_nothing
 from tcmrl_data.interchange.readers.source_files import path_digest
 from tcmrl_data.interchange.survey import Survey
-from tcmrl_data.recipe.foreign import bound_recipe, foreign_recipe
+from tcmrl_data.recipe.foreign import bound_recipe, check_licence, foreign_recipe
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.limits import check_plan
@@ -101,13 +101,14 @@ def import_dataset(
             the files' own words hold, and what they do not name is a training task without parameters.
         options: of the reader.
         label: the dataset's own name.
-        licence: of the data; recorded as their origin, like `url`.
+        licence: of the data, an SPDX expression; recorded as their origin, like `url`.
         url: where the data come from.
         dry_run: read and check only.
         progress: called as parts are published.
 
     Raises:
         UnknownNameError: there is no such reader or environment.
+        RecipeError: SPDX does not know the licence.
         MissingPackageError: an optional package of the reader is not installed.
         StoreError: a file is damaged, not of the format, or larger inside than its size justifies; episodes
             do not fit each other or the environment; `out` is in use; a file changes meanwhile.
@@ -122,6 +123,7 @@ def import_dataset(
     """
     if hidden_text([label, licence, url]) is not None:
         raise StoreError("label, licence or url holds control characters; leave them out")
+    check_licence(licence)
     kind = READERS.get(format_name)
     require_packages(f"import of {format_name}", kind.optional_packages, kind.extra)
     reader = kind(

@@ -18,7 +18,7 @@ from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.interchange.readers.episodes import Cuts, episode
-from tcmrl_data.recipe.foreign import bound_recipe, foreign_recipe
+from tcmrl_data.recipe.foreign import bound_recipe, check_licence, foreign_recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_folder
@@ -48,7 +48,7 @@ class DatasetRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         split: of the task.
         parameters: of the task.
         label: the dataset's own name.
-        licence: of the data.
+        licence: of the data, an SPDX expression.
         url: where the environment or the data are described.
 
     Raises:
@@ -85,6 +85,7 @@ class DatasetRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         super().__init__(env)
         if part_episodes < 1:
             raise StoreError(f"part_episodes must be 1 or more, got {part_episodes}")
+        check_licence(licence)
         observation_dim, action_dim = _sizes(env)
         self._horizon = _horizon(env, horizon)
         self._recipe = (

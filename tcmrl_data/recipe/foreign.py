@@ -3,8 +3,10 @@
 from collections.abc import Mapping
 
 from tcmrl_data.envs.foreign import Foreign
+from tcmrl_data.foundation.errors import RecipeError
+from tcmrl_data.foundation.licences import licence_problem
+from tcmrl_data.recipe.about import About
 from tcmrl_data.recipe.recipe import (
-    About,
     BehaviorTable,
     EnvironmentTable,
     NoRollouts,
@@ -81,9 +83,28 @@ def bound_recipe(environment: str, *, licence: str | None) -> Recipe:
     recipe = load_recipe(environment)
     return recipe.model_copy(
         update={
-            "about": recipe.about.model_copy(update={"citation": UNKNOWN, "licence": licence or UNKNOWN}),
+            "about": recipe.about.model_copy(
+                update={
+                    "citation": UNKNOWN,
+                    "licence": licence or UNKNOWN,
+                    "authors": (),
+                    "url": None,
+                    "doi": None,
+                }
+            ),
             "behavior": UNKNOWN_BEHAVIOR,
             "rollouts": NoRollouts(),
             "build": TaskChoice(),
         }
     )
+
+
+def check_licence(licence: str | None) -> None:
+    """Checks the licence that someone gives for data from elsewhere.
+
+    Raises:
+        RecipeError: SPDX does not know it.
+    """
+    problem = None if licence is None else licence_problem(licence)
+    if problem:
+        raise RecipeError(f"licence: {problem}")

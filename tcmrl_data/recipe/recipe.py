@@ -13,20 +13,13 @@ from tcmrl_data.envs.controller import View
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.errors import RecipeError, TcmrlError
 from tcmrl_data.foundation.validation import validate_table
+from tcmrl_data.recipe.about import About, read_about
 from tcmrl_data.recipe.document import merge_tables, open_recipe, read_override
 from tcmrl_data.recipe.profile import Profile
 
 
 class _Table(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-
-class About(_Table):
-    """What a dataset says of itself; no part of any digest."""
-
-    description: str
-    citation: str
-    licence: str
 
 
 class Rollouts(_Table):
@@ -185,7 +178,7 @@ def load_recipe(
     training = {name: document.tables(name).get("training", {}) for name in document.profiles}
     return Recipe(
         profile=profile,
-        about=validated(About, tables["about"], table="about"),
+        about=read_about(tables["about"], place),
         environment=EnvironmentTable.model_validate(environment.model_dump(mode="json")),
         behavior=_behavior_table(tables["behavior"], place),
         rollouts=validated(Rollouts, tables["rollouts"], table="rollouts"),

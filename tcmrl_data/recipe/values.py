@@ -11,8 +11,8 @@ from tcmrl_data.recipe.document import RecipeDocument, open_recipe, read_overrid
 from tcmrl_data.recipe.profile import Profile
 from tcmrl_data.recipe.recipe import Recipe, load_recipe
 
-NAME = ("environment", "name")
-"""The one key that cannot be set."""
+NOT_SHOWN = {("environment", "name"), ("about", "references")}
+"""Keys that `--set` does not take: a name that has no effect, and a list of tables."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ def recipe_values(
         tuple(
             RecipeValue(".".join(path), value, sources.get(path, "default"))
             for path, value in values.items()
-            if path != NAME
+            if path not in NOT_SHOWN
         ),
     )
 

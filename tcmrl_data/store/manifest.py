@@ -11,6 +11,7 @@ from pydantic import FailFast, Field, field_validator, model_validator
 from tcmrl_data.envs.tasks import Split
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, canonical_json, digest, parse_json
 from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.foundation.licences import AND, joined_licences
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
 from tcmrl_data.foundation.ranges import read_ranges
 from tcmrl_data.foundation.records import Record, parse_record
@@ -184,6 +185,12 @@ class Manifest(Record):
     def profile(self) -> Profile:
         """The profile that the dataset was built with."""
         return self.recipe.profile
+
+    @property
+    def licences(self) -> tuple[str, ...]:
+        """The licences of all runs, sorted; a run without a recipe has that of the first one."""
+        found = [run.recipe.about.licence for run in self.runs if run.recipe is not None]
+        return tuple(joined_licences(found).split(AND))
 
     @property
     def training(self) -> dict[Profile, dict[str, Any]]:

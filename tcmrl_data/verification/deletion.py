@@ -6,7 +6,14 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.work_files import ASSEMBLY, TABLES, WORK_FILES, WORK_FOLDERS, check_work_files
+from tcmrl_data.build.work_files import (
+    ASSEMBLY,
+    CROISSANT_FILES,
+    TABLES,
+    WORK_FILES,
+    WORK_FOLDERS,
+    check_work_files,
+)
 from tcmrl_data.foundation.disk import LOCK, disk, lock_file, lock_holder, named_errors, remove_tree
 from tcmrl_data.foundation.errors import LockedError, StoreError
 from tcmrl_data.store.keys import PARTS, key_of_file
@@ -79,7 +86,9 @@ def _deletion(folder: Path, scan: Scan) -> Deletion:
 
 def _is_own(file: str, mode: int) -> bool:
     """Whether a file is one that a dataset has: a plain file of such a name."""
-    return stat.S_ISREG(mode) and (file in {MANIFEST, *TABLES} or key_of_file(file) is not None)
+    return stat.S_ISREG(mode) and (
+        file in {MANIFEST, *TABLES, *CROISSANT_FILES} or key_of_file(file) is not None
+    )
 
 
 def _remove(folder: Path, scan: Scan) -> None:

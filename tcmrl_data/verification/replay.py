@@ -103,7 +103,7 @@ def _make_again(archive: Archive, record: PartRecord, plan: BuildPlan) -> dict[s
     (task,) = plan.tasks
     derived, place = record.identity.derived, str(archive.path)
     parameters = [task.parameters] * plan.recipe.rollouts.lanes
-    with _one_thread(), contextlib.closing(plan.environment.lanes(parameters)) as lanes:
+    with one_thread(), contextlib.closing(plan.environment.lanes(parameters)) as lanes:
         if derived is not None and derived.get("operation") == RELABEL:
             settings = read_settings(Relabelling, derived, place)
             return pack(
@@ -127,7 +127,7 @@ def _make_again(archive: Archive, record: PartRecord, plan: BuildPlan) -> dict[s
 
 
 @contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
+def one_thread() -> Iterator[None]:
     """One torch thread, as in a worker: reductions split by thread round differently."""
     import torch
 

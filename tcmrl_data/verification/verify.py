@@ -12,6 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from tcmrl_data.build.work_files import DESCRIPTIONS
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.view import is_view_file
 from tcmrl_data.foundation.disk import LOCK, lock_holder
@@ -157,7 +158,7 @@ class _Verification:
             table, runs = self._description.table, {run.name: run for run in manifest.runs}
             for file, problem in derived_problems(self._folder, table, runs, bad=bad):
                 self._add(file, problem)
-        self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *entries, *unnamed})
+        self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *DESCRIPTIONS, *entries, *unnamed})
         return len(entries)
 
     def replay(self, number: int) -> tuple[Replay, ...]:

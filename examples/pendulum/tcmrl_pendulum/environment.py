@@ -3,14 +3,19 @@
 import importlib.resources
 from importlib.metadata import version
 from importlib.resources.abc import Traversable
-from typing import Any, final
+from typing import TYPE_CHECKING, Any, final
 
 import gymnasium
 import numpy as np
 from pydantic import Field
 
 from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
+from tcmrl_data.envs.camera import FigureCamera
 from tcmrl_data.envs.controller import View
+from tcmrl_data.envs.trajectory import FloatArray
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
 
 NOMINAL = {"gravity": 10.0, "mass": 1.0, "length": 1.0}
 """Pendulum-v1's own values, in m/s², kg and m."""
@@ -56,5 +61,31 @@ class Pendulum(Environment):
         in_unit_range = RescaleAction(simulator, np.float32(-1.0), np.float32(1.0))
         return TimeLimit(in_unit_range, self.settings.horizon)
 
+    def camera(
+        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
+    ) -> "PendulumCamera":
+        return PendulumCamera(parameters["length"], width, height)
+
     def fingerprint(self) -> dict[str, Any]:
         return {"versions": {"gymnasium": version("gymnasium")}}
+
+
+@final
+class PendulumCamera(FigureCamera):
+    """Draws the rod from the pivot to its end.
+
+    Args:
+        length: of the rod in m.
+        width: of the picture in pixels.
+        height: of the picture in pixels.
+    """
+
+    def __init__(self, length: float, width: int, height: int) -> None:
+        super().__init__(width, height)
+        self._length, self._shape = length, height / width
+
+    def draw(self, axes: "Axes", observations: FloatArray) -> None:
+        cosine, sine, _ = observations[-1]  # of the angle from upright
+        axes.plot([0.0, -self._length * sine], [0.0, self._length * cosine], "o-", linewidth=5)
+        reach = 1.2 * self._length / self._shape
+        axes.set(xlim=(-reach, reach), ylim=(-1.2 * self._length, 1.2 * self._length))

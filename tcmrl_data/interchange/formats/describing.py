@@ -9,6 +9,7 @@ from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.licences import AND
 from tcmrl_data.store.keys import PartKey
 
 
@@ -34,7 +35,7 @@ def task_attributes(selection: Selection, task: Task, *, layout: str, version: i
         "dataset_root": manifest.root,
         "recipe": json.dumps(manifest.recipe.unit_settings(), sort_keys=True),
         "citation": manifest.recipe.about.citation,
-        "licence": manifest.recipe.about.licence,
+        "licence": AND.join(manifest.licences),
     }
     return attributes if manifest.seed is None else attributes | {"seed": manifest.seed}
 

@@ -33,6 +33,7 @@ from tcmrl_data.dataset.tables import TaskReferences
 from tcmrl_data.envs.base import make_environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.licences import AND
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.interchange.formats.base import Format
 from tcmrl_data.interchange.formats.describing import stored_episodes, task_attributes
@@ -177,7 +178,7 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
         "description": (
             f"Task {task.index} of {dataset.name} ({task.split}), parameters "
             f"{json.dumps(dict(task.parameters), sort_keys=True)}. {recipe.about.description} "
-            f"Source: {recipe.about.citation}. Licence: {recipe.about.licence}. "
+            f"Source: {recipe.about.citation}. Licence: {AND.join(dataset.manifest.licences)}. "
             f"Exported from the dataset with root {dataset.manifest.root}."
         ),
     }

@@ -1,0 +1,73 @@
+"""The settings that tuning found, for the methods of an experiment."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from tcmrl_algo.experiment.config import Experiment
+from tcmrl_algo.experiment.results import Tuned
+from tcmrl_algo.tuning.record import RECORD, Tuning, read_tuning
+from tcmrl_data import TrainingError
+
+
+def tuned_settings(
+    experiment: Experiment, folder: str | Path, environments: Sequence[str] = ()
+) -> dict[str, dict[str, Tuned]]:
+    """The best settings of every environment and algorithm of an experiment.
+
+    Args:
+        experiment: whose environments may name the environment of which the settings are.
+        folder: of tunings, each in `ENV-ALGO`, where `tcmrl tune` puts it.
+        environments: those that are wanted; all where empty.
+
+    Raises:
+        TrainingError: a method was not tuned, no trial of it ended well, or methods of an environment were
+            tuned with unequal effort.
+    """
+    found = {
+        environment: {
+            algorithm: _tuned(Path(folder) / f"{choice.tuning or environment}-{algorithm}", algorithm)
+            for algorithm in sorted({method.algorithm for method in experiment.methods.values()})
+        }
+        for environment, choice in experiment.environments.items()
+        if not environments or environment in environments
+    }
+    for environment, methods in found.items():
+        efforts = {name: (one.trials, one.steps, one.seeds, one.root) for name, one in methods.items()}
+        (first, effort), *others = efforts.items()
+        for name, other in others:
+            if other != effort:
+                raise TrainingError(
+                    f"{folder}: {first} was tuned for {environment} by {_effort(methods[first])}, {name} by "
+                    f"{_effort(methods[name])}; tune methods with equal effort to compare them"
+                )
+    return found
+
+
+def _tuned(folder: Path, algorithm: str) -> Tuned:
+    if not (folder / RECORD).is_file():
+        raise TrainingError(
+            f"{folder} holds no tuning; `tcmrl tune --algo {algorithm} --out {folder}` makes one"
+        )
+    tuning = read_tuning(folder)
+    best = tuning.best_trial
+    if best is None or best.score is None:
+        raise TrainingError(f"{folder}: no trial ended well")
+    return Tuned(
+        environment=tuning.environment,
+        root=tuning.root,
+        profile=tuning.profile,
+        trials=_num_ended(tuning),
+        steps=tuning.steps,
+        seeds=tuning.seeds,
+        score=best.score,
+        overrides=best.overrides,
+    )
+
+
+def _num_ended(tuning: Tuning) -> int:
+    return sum(trial.is_done for trial in tuning.trials)
+
+
+def _effort(tuned: Tuned) -> str:
+    seeds = f"{len(tuned.seeds)} seed{'s' * (len(tuned.seeds) != 1)}"
+    return f"{tuned.trials} trials of {tuned.steps} steps with {seeds} on {tuned.root[:12]}"

@@ -1,0 +1,1 @@
+"""HTML pages in one file: escaped markup, figures, and the frame around them. Knows no dataset."""

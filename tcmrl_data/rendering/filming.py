@@ -1,0 +1,134 @@
+"""Stored episodes played again: every step is compared with the stored one, and pictures are taken."""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import final
+
+import numpy as np
+
+from tcmrl_data.envs._open_gl import check_chosen_kind
+from tcmrl_data.envs.base import Environment, EnvironmentLanes
+from tcmrl_data.envs.camera import Camera, Picture
+from tcmrl_data.envs.controller import Controller, PlaybackController, Transition, View
+from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.foundation.errors import RenderingError, SimulationError
+from tcmrl_data.rendering.stored_episode import StoredEpisode
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A picture of an episode.
+
+    Attributes:
+        picture: (height, width, 3).
+        steps: done before it was taken.
+        reward: sum of the rewards of these steps.
+    """
+
+    picture: Picture
+    steps: int
+    reward: float
+
+
+def film(
+    environment: Environment,
+    episode: StoredEpisode,
+    *,
+    frames: int,
+    width: int,
+    height: int,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> list[Frame]:
+    """Plays an episode again and takes pictures, evenly spread from its start to its end.
+
+    Args:
+        environment: of its task.
+        episode: that is played.
+        frames: most pictures.
+        width: of the pictures in pixels.
+        height: of the pictures in pixels.
+        progress: called with steps done and steps in all.
+
+    Raises:
+        RenderingError: the environment has no camera, or this machine cannot draw it.
+        SimulationError: a step differs from the stored one; names the first such step.
+    """
+    steps = len(episode.trajectory)
+    moments = np.linspace(0, steps, min(frames, steps + 1)).round().astype(int)
+    if environment.simulator_bytes:
+        check_chosen_kind()
+    with contextlib.ExitStack() as stack:
+        task = environment.make(episode.parameters, view="full")
+        lanes = stack.enter_context(contextlib.closing(EnvironmentLanes(environment, [task])))
+        camera = environment.camera(task, episode.parameters, width=width, height=height)
+        if camera is None:
+            raise RenderingError(
+                f"environment {environment.name!r} has no picture; give its class a method `camera`"
+            )
+        stack.callback(camera.close)
+        controller = _FilmingController(environment, episode, camera, set(moments.tolist()), progress)
+        roll_out(
+            environment,
+            lanes,
+            controller,
+            reset_seeds=[episode.reset_seed],
+            noise=[np.random.default_rng(0)],  # drawn by every rollout, and not used
+        )
+        return controller.frames
+
+
+@final
+class _FilmingController(Controller):
+    """Plays one stored episode, compares every step with it, and takes pictures at some moments."""
+
+    view: View = "full"
+
+    def __init__(
+        self,
+        environment: Environment,
+        episode: StoredEpisode,
+        camera: Camera,
+        moments: set[int],
+        progress: Callable[[int, int], None],
+    ) -> None:
+        self.frames: list[Frame] = []
+        self._environment, self._episode, self._camera = environment, episode, camera
+        self._moments, self._progress = moments, progress
+        self._playback = PlaybackController([episode.trajectory.actions])
+        self._seen: list[FloatArray] = []
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        if not self._seen:
+            self._see(observations[0])
+        return self._playback.act(observations, noise)
+
+    def observe(self, transition: Transition) -> None:
+        stored, step = self._episode.trajectory, len(self._seen) - 1
+        for name, there, here in (
+            ("reward", stored.rewards[step], transition.rewards[0]),
+            ("terminated", stored.terminated[step], transition.terminated[0]),
+            ("truncated", stored.truncated[step], transition.truncated[0]),
+        ):
+            if not _equal(here, there):
+                raise self._difference(name, step)
+        self._see(transition.next_observations[0])
+
+    def _see(self, observation: FloatArray) -> None:
+        stored, step = self._episode.trajectory, len(self._seen)
+        if not _equal(self._environment.stored_view(observation), stored.observations[step]):
+            raise self._difference("observation", step)
+        self._seen.append(observation.copy())
+        self._progress(step, len(stored))
+        if step in self._moments:
+            reward = float(np.sum(stored.rewards[:step], dtype=np.float64))
+            self.frames.append(Frame(self._camera.picture(np.stack(self._seen)), step, reward))
+
+    def _difference(self, what: str, step: int) -> SimulationError:
+        return SimulationError(f"{self._episode}: does not replay, its {what} differs first at step {step}")
+
+
+def _equal(here: FloatArray, there: FloatArray) -> bool:
+    """Whether a simulated value is stored bit for bit; NaN equals NaN, and 0 differs from -0."""
+    return here.astype(there.dtype).tobytes() == there.tobytes()

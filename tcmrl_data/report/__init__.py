@@ -1,0 +1,1 @@
+"""A dataset's report: a page that shows what is in it."""

@@ -1,0 +1,139 @@
+"""Completion: what real shells are told, from the files below a folder, without a library that computes."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.test_imports import loaded_after
+
+BIN = Path(sys.executable).parent
+PROGRAMS = {"tcmrl-data": "_tcmrl_data_completion", "tcmrl": "_tcmrl_completion"}
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two datasets, of which one names training settings, and a run."""
+    folder = tmp_path_factory.mktemp("place")
+    training = {"paper": {"batch": {"tasks": 1}}}
+    manifest = {"runs": [{"recipe": {"training": training}}]}
+    for file, text in {
+        "data/point-robot/manifest.json": json.dumps(manifest),
+        "data/point-robot/parts/main/00000/inner/manifest.json": "",
+        "data/lab/walker/manifest.json": "",
+        "data/.hidden/x/manifest.json": "",
+        "elsewhere/mine/manifest.json": "",
+        "runs/first/run.json": "",
+        "my-recipe.toml": "[rollouts]\nepisodes = 3\n",
+    }.items():
+        (folder / file).parent.mkdir(parents=True, exist_ok=True)
+        (folder / file).write_text(text)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def environment() -> dict[str, str]:
+    return os.environ | {"PATH": f"{BIN}:{os.environ['PATH']}"}
+
+
+@pytest.fixture(scope="module")
+def scripts(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str]) -> Path:
+    """A folder with the bash script of each program."""
+    folder = tmp_path_factory.mktemp("scripts")
+    for program in PROGRAMS:
+        command = [program, "completion", "bash"]
+        result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        assert result.stderr == ""
+        (folder / program).write_text(result.stdout)
+    return folder
+
+
+def in_bash(place: Path, scripts: Path, environment: dict[str, str], *words: str) -> list[str]:
+    """What bash offers for the last word."""
+    program = words[0]
+    script = (
+        f"source {scripts / program}\n"
+        f"complete -p {program} | grep -q -- '-F {PROGRAMS[program]}' || exit 9\n"
+        'COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1))\n'
+        "compopt() { COMPREPLY=(FILES); }\n"  # bash's own works only while a person completes
+        f"{PROGRAMS[program]} {program}\n"
+        'printf "%s\\n" "${COMPREPLY[@]}"\n'
+    )
+    command = ["bash", "--norc", "-c", script, "bash", *words]
+    result = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, check=True)
+    return result.stdout.split()
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("tcmrl-data ins", ["inspect"]),
+        ("tcmrl-data show ", ["data/lab/walker", "data/point-robot"]),
+        ("tcmrl-data show data/p", ["data/point-robot"]),
+        ("tcmrl-data show elsewhere/", ["elsewhere/mine"]),
+        ("tcmrl-data show my", ["FILES"]),
+        ("tcmrl-data build wal", ["walker-rand-params"]),
+        ("tcmrl-data build m", ["ml1/"]),
+        ("tcmrl-data build my", ["FILES"]),
+        ("tcmrl-data build point-robot --set rollouts.e", ["rollouts.episodes="]),
+        ("tcmrl-data build my-recipe.toml --set r", ["rollouts.episodes="]),
+        ("tcmrl-data export data/point-robot --tier medium-r", ["medium-replay"]),
+        ("tcmrl-data export data/point-robot --format hd", ["hdf5"]),
+        ("tcmrl train data/po", ["data/point-robot"]),
+        ("tcmrl train data/point-robot --set b", ["batch.tasks="]),
+        ("tcmrl train --algo task", ["task_known"]),
+        ("tcmrl evaluate ru", ["runs/first"]),
+        ("tcmrl evaluate runs/first --protocol off", ["offline"]),
+        ("tcmrl experiment tou", ["tour"]),
+    ],
+)
+def test_bash_completes(
+    place: Path, scripts: Path, environment: dict[str, str], line: str, expected: list[str]
+) -> None:
+    assert in_bash(place, scripts, environment, *line.split(" ")) == expected
+
+
+def test_the_members_of_a_family_follow_its_slash(
+    place: Path, scripts: Path, environment: dict[str, str]
+) -> None:
+    found = in_bash(place, scripts, environment, "tcmrl-data", "build", "ml1/reach")
+    assert found == ["ml1/reach", "ml1/reach-wall"]
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_the_scripts_of_other_shells_are_sound(
+    shell: str, environment: dict[str, str], tmp_path: Path
+) -> None:
+    command = ["tcmrl-data", "completion", shell]
+    script = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    assert f"_TCMRL_DATA_COMPLETE={shell}_complete" in script
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed")
+    (tmp_path / "script").write_text(script)
+    subprocess.run([shell, "-n", str(tmp_path / "script")], check=True)
+
+
+@pytest.mark.parametrize(
+    "words", ["tcmrl-data show da", "tcmrl-data build point-robot --set r", "tcmrl train --algo t"]
+)
+def test_completing_loads_nothing_heavy(words: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    program = words.split(" ")[0]
+    module, name = ("data", "data") if program == "tcmrl-data" else ("train", "tcmrl")
+    monkeypatch.chdir(place)
+    monkeypatch.setenv(f"_{program.replace('-', '_').upper()}_COMPLETE", "bash_complete")
+    monkeypatch.setenv("COMP_WORDS", words)
+    monkeypatch.setenv("COMP_CWORD", str(words.count(" ")))
+    code = (
+        f"from tcmrl_cli.{module} import {name}\n"
+        "from tcmrl_cli.frame import run\n"
+        "try:\n"
+        f"    run({name})\n"
+        "except SystemExit as ended:\n"
+        "    assert ended.code == 0\n"
+        "assert not {'pydantic', 'numpy', 'gymnasium'} & sys.modules.keys()\n"
+    )
+    assert loaded_after(code) == set()

@@ -1,0 +1,245 @@
+"""`tcmrl-data report`: numbers as `inspect` prints them, texts of strangers, and what is refused."""
+
+import base64
+import importlib.util
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tcmrl_cli.data import data
+
+import tcmrl_data
+from tcmrl_data import Dataset
+from tcmrl_data.dataset.returns import episode_table
+from tcmrl_data.foundation.errors import RenderingError
+from tcmrl_data.page.markup import cell_text
+from tcmrl_data.quality.worth import context_worth
+from tcmrl_data.report import content as contents
+from tcmrl_data.report.content import Content, measure
+from tcmrl_data.report.evenly import evenly
+from tcmrl_data.report.figures import learning_curves
+from tcmrl_data.report.measures import ACTION_BINS, SATURATED
+from tcmrl_data.report.plane import choose_plane
+from tcmrl_data.report.quality_figures import overlap, rewards, scores
+from tcmrl_data.report.report import compose, ignore, report_dataset
+from tcmrl_data.report.strips import Strips, film_strips
+from tcmrl_data.store.keys import PartKey
+from tests.commands import assert_refused, in_process
+from tests.test_page import documents
+
+HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+
+
+@pytest.fixture(scope="module")
+def content(tiny: Dataset) -> Content:
+    return measure(tiny, browsed=4, progress=ignore)
+
+
+@pytest.fixture(scope="module")
+def page(content: Content) -> str:
+    return compose(content).html()
+
+
+def all_arrays(dataset: Dataset) -> list[tuple[PartKey, dict[str, Any]]]:
+    return [
+        (key, dataset.arrays(*key)) for task in dataset.tasks for key in dataset.parts.keys_of(task.index)
+    ]
+
+
+@pytest.mark.skipif(importlib.util.find_spec("plotly") is None, reason="plotly is not installed")
+def test_curves_are_the_numbers_of_inspect(page: str, tiny: Dataset) -> None:
+    traces = documents(page)[0]["frames"][0]["traces"]
+    drawn = {
+        trace["hovertemplate"].split("<extra>")[1].removesuffix("</extra>"): [
+            np.frombuffer(base64.b64decode(trace[axis]["bdata"]), "<f8").tolist() for axis in ("x", "y")
+        ]
+        for trace in traces
+        if "legendgroup" in trace
+    }
+    assert drawn == {
+        f"task {task['task']} ({task['split']})": [
+            [found["step"] for found in task["snapshots"]],
+            [found["mean"] for found in task["snapshots"]],
+        ]
+        for task in tcmrl_data.return_table(tiny)["tasks"]
+    }
+
+
+def test_tables_are_the_numbers_of_inspect(
+    page: str, tiny: Dataset, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call = in_process(data, capsys)
+    tasks = json.loads(call("inspect", "tasks", tiny.folder, "--json")[1])
+    for row in tasks["tasks"]:
+        cells = [row["task"], row["split"], *(row["references"][name] for name in ("uniform", "oracle"))]
+        assert "".join(f">{cell_text(cell)}</td>" for cell in cells) in page.replace("<td", "").replace(
+            ' class="text"', ""
+        )
+    for difference in tasks["shift"]:
+        assert f">{cell_text(difference['standardized'])}</td>" in page
+    assert tiny.manifest.root in page
+    assert tiny.manifest.digest in page
+
+
+def test_measures_are_the_records_of_inspect(
+    page: str, content: Content, tiny: Dataset, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call = in_process(data, capsys)
+    for name, record in (
+        ("quality", content.quality),
+        ("coverage", content.coverage),
+        ("rewards", content.rewards),
+    ):
+        assert json.loads(call("inspect", name, tiny.folder, "--json")[1]) == record.model_dump(mode="json")
+    cells = [figure.frames[0].cells for figure in (scores(content), overlap(content))]
+    shown = {found.unit: found.z for found in cells if found is not None}
+    expected = [[snapshot.tq for snapshot in task.snapshots] for task in content.quality.tasks]
+    assert shown["TQ"] == pytest.approx(np.array(expected, np.float32))
+    assert shown["share of cells"] == pytest.approx(np.array(content.coverage.overlap.shares, np.float32))
+    last = rewards(content).frames[-1].series[0]
+    assert last.y.sum() == pytest.approx(1.0)
+    shares = np.array(content.coverage.overlap.shares)
+    others = shares[~np.eye(len(shares), dtype=bool)].mean()
+    assert f"Tasks share {others:.0%} of their states" in page
+
+
+def test_visits_count_every_state_in_the_plane(content: Content, tiny: Dataset) -> None:
+    arrays = all_arrays(tiny)
+    assert content.visits.total == sum(len(found["observations"]) for _, found in arrays)
+    inside = sum(int(counts.sum()) for counts in content.visits.counts.values())
+    assert (content.visits.outside, inside) == (
+        0,
+        content.visits.total,
+    )  # every part was sampled for the borders
+    plane = content.plane
+    assert (plane.names, plane.explained) == (("x", "y"), None)
+    task = tiny.tasks[0].index
+    states = np.concatenate([found["observations"] for key, found in arrays if key.task == task])
+    edges = [np.linspace(plane.low[axis], plane.high[axis], 33) for axis in (1, 0)]
+    expected = np.histogram2d(states[:, 1], states[:, 0], edges)[0]
+    assert np.abs(content.visits.counts[task] - expected).sum() <= 4  # a state on a border
+
+
+def test_actions_and_endings_are_those_of_the_episodes(content: Content, tiny: Dataset) -> None:
+    last = max(content.actions.counts)
+    own = np.concatenate([found["actions"] for key, found in all_arrays(tiny) if key.step == last])
+    expected = [
+        np.histogram(np.clip(column, -1, 1), np.linspace(-1, 1, ACTION_BINS + 1))[0] for column in own.T
+    ]
+    assert np.abs(content.actions.counts[last] - expected).sum() <= 8
+    assert content.actions.saturated_share(last) == (np.abs(own) >= SATURATED).mean()
+    rows = [row for row in episode_table(tiny)["episodes"] if row["step"] == last]
+    found = content.episodes.found[last]
+    assert (found.episodes, found.steps) == (len(rows), sum(row["length"] for row in rows))
+    assert (found.terminated, found.truncated) == (0, len(rows))
+    returns = np.histogram([row["return"] for row in rows], content.episodes.edges)[0]
+    assert found.returns.tolist() == returns.tolist()
+
+
+def test_browsed_episodes_are_the_stored_ones(content: Content, tiny: Dataset) -> None:
+    assert len(content.browsed) == 4
+    for found in content.browsed:
+        stored = tiny.trajectories(*found.key)[found.episode]
+        assert (found.rewards == stored.rewards).all()
+        assert (found.observations == stored.observations[:-1]).all()
+        assert (found.actions == stored.actions).all()
+        assert found.ended == "truncated"
+    assert [found.key for found in content.browsed][0::3] == [(0, 0, "main"), (99, 150, "main")]
+
+
+def test_paths_are_cut_between_episodes(content: Content, tiny: Dataset) -> None:
+    key = PartKey(0, 150)
+    states = [trajectory.observations for trajectory in tiny.trajectories(*key)[:3]]
+    gap = np.full((1, 2), np.nan, np.float32)
+    expected = np.concatenate([row for path in states for row in (path, gap)])
+    assert np.array_equal(content.paths.found[key], expected, equal_nan=True)
+
+
+def test_without_named_columns_the_plane_keeps_most_variance(
+    tiny: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(type(tiny.environment), "plane", None)
+    plane = choose_plane(tiny, [key for key, _ in all_arrays(tiny)])
+    assert plane.explained == pytest.approx(1.0)  # of two columns
+    states = np.concatenate([plane.project(found["observations"]) for _, found in all_arrays(tiny)])
+    assert np.cov(states.T)[0, 1] == pytest.approx(0.0, abs=1e-9)
+    assert (states > plane.low).all()
+    assert (states < plane.high).all()
+
+
+def test_of_many_tasks_some_are_drawn(
+    content: Content, tiny: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(contents, "SHOWN_TASKS", 2)
+    few = measure(tiny, browsed=1, progress=ignore)
+    assert [task.index for task in few.shown] == [0, 99]
+    assert sorted(few.visits.counts) == [0, 99]
+    assert sum(found.episodes for found in few.episodes.found.values()) == tiny.manifest.totals.episodes
+    assert "2 evenly chosen tasks are shown, 3 others are not." in compose(few, is_interactive=False).html()
+    curves = learning_curves(few).frames[0].series
+    assert {line.label for line in curves if line.group} == {
+        f"task {task.index} ({task.split})" for task in few.shown
+    }
+    assert evenly([1, 2, 3], 9) == (1, 2, 3)
+
+
+def test_a_hostile_label_stays_text(tiny_copy: Callable[[], Path], tmp_path: Path) -> None:
+    folder = tiny_copy()
+    tcmrl_data.rename_dataset(folder, HOSTILE)
+    for is_interactive in (True, False):
+        file = report_dataset(
+            tcmrl_data.open_dataset(folder), tmp_path / "a" / "report.html", is_interactive=is_interactive
+        )
+        text = file.read_text(encoding="utf-8")
+        assert "<img src=x" not in text
+        assert "<script>alert" not in text
+        assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+
+
+def test_the_command_writes_one_file(
+    tiny_copy: Callable[[], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    call, folder = in_process(data, capsys), tiny_copy()
+    code, output, errors = call("report", folder, "--json", "--pictures", "--episodes", 2)
+    file = folder.with_name(f"{folder.name}-report.html")
+    assert (code, json.loads(output)) == (0, {"report": str(file), "bytes": file.stat().st_size})
+    assert "pip install 'tcmrl[report]'" in file.read_text(encoding="utf-8").replace("&#x27;", "'")
+    code, output, errors = call("report", folder, "--out", file, "--quiet")
+    assert (code, errors) == (0, "")
+    assert output.startswith(f"{file}: written, ")
+    assert file.stat().st_size < 6e6
+
+
+def test_a_damaged_part_and_an_empty_dataset_are_refused(
+    tiny_copy: Callable[[], Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    call, folder = in_process(data, capsys), tiny_copy()
+    part = next((folder / "parts").rglob("*.zip"))
+    part.write_bytes(part.read_bytes()[:-1])
+    assert_refused(call("report", folder, "--out", tmp_path / "x.html", "--quiet"), str(part), "repair")
+    assert not (tmp_path / "x.html").exists()
+    assert_refused(call("report", tmp_path), "does not exist")
+
+
+def test_policies_in_other_tasks_and_pictures_are_shown_if_asked_for(tiny: Dataset, page: str) -> None:
+    found = measure(tiny, browsed=1, transfer=True, strips=2, progress=lambda stage, done, total: None)
+    assert found.transfer == tcmrl_data.measure_transfer(tiny)
+    assert found.strips is not None
+    assert [strip.content[:4] for strip in found.strips.drawn] == [b"\x89PNG"] * 2
+    text = compose(found, is_interactive=False).html()
+    assert 'id="cross-task-returns"' in text and text.count("Played again from its seed") == 4  # alt, caption
+    _, splits = context_worth(found.transfer)
+    assert f"A context is worth {'only ' if splits[-1].worth < 0.1 else ''}{splits[-1].worth:.0%}" in text
+    assert 'id="cross-task-returns"' not in page and "Played again" not in page
+
+
+def test_an_environment_without_a_picture_is_said(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*args: Any, **keywords: Any) -> None:
+        raise RenderingError("it has no picture")
+
+    monkeypatch.setattr("tcmrl_data.report.strips.render_episode", refuse)
+    found = film_strips(tiny, tiny.tasks, 2, progress=lambda done, total: None)
+    assert found == Strips((), "it has no picture")

@@ -1,0 +1,162 @@
+"""Experiments that take over trainings of others, and tuned settings."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from tcmrl_cli.train import tcmrl
+
+from tcmrl_algo import ExperimentReport, run_experiment, tuned_settings
+from tcmrl_algo.experiment.config import Experiment, read_experiment
+from tcmrl_algo.experiment.planning import plan_runs
+from tcmrl_algo.tuning.record import RECORD, Trial, Tuning
+from tcmrl_data import CheckpointError, TrainingError
+from tcmrl_data.foundation.records import write_record
+from tests import experiments
+from tests.commands import Call, assert_refused, in_process
+
+METHODS = {"TCMRL": {"algorithm": "tcmrl"}}
+
+
+def _experiment(dataset: Path, **changes: Any) -> Experiment:
+    given = {"methods": METHODS, "seeds": [0], "protocols": ["offline"], "claims": []} | changes
+    return read_experiment(experiments.tables(dataset, **given), place="test")
+
+
+@pytest.fixture(scope="module")
+def source(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ExperimentReport]:
+    """An experiment with one finished run."""
+    out = tmp_path_factory.mktemp("source") / "results"
+    return out, run_experiment(_experiment(tiny_folder), out, workers=1)
+
+
+def _with_run(dataset: Path, **run: Any) -> Experiment:
+    training = experiments.SMALL | {"run": experiments.SMALL["run"] | run}
+    return _experiment(dataset, training=training, curve_points=1)
+
+
+def test_an_equal_training_is_evaluated_only(
+    source: tuple[Path, ExperimentReport], tiny_folder: Path, tmp_path: Path
+) -> None:
+    folder, made = source
+    (before,) = made.results
+    other = _experiment(
+        tiny_folder,
+        name="other",
+        methods={"full": {"algorithm": "tcmrl", "training": {"run": {"log_every": 20}}}},
+        protocols=["offline", "paper"],
+    )
+    (result,) = run_experiment(other, tmp_path / "other", reuse=[folder]).results
+    assert result.training_of == "small, TCMRL"
+    assert (result.experiment, result.method) == ("other", "full")
+    assert result.digest == before.digest
+    assert result.evaluations["offline"] == before.evaluations["offline"]
+    assert result.training_seconds == before.training_seconds
+    assert [point.final for point in result.curve] == [point.final for point in before.curve]
+    assert sum(point.timed_steps for point in result.curve[-1:]) == 0
+    (trained,) = run_experiment(other, tmp_path / "trained", workers=1).results
+    assert trained.training_of is None
+    assert trained.digest == before.digest
+    assert trained.evaluations == result.evaluations
+
+
+def test_other_evaluation_settings_evaluate_the_same_tensors_anew(
+    source: tuple[Path, ExperimentReport], tiny_folder: Path, tmp_path: Path
+) -> None:
+    folder, made = source
+    other = _with_run(tiny_folder, offline_trajectories=1)
+    (result,) = run_experiment(other, tmp_path, reuse=[folder]).results
+    assert result.digest == made.results[0].digest
+    assert result.config.settings.run.offline_trajectories == 1
+    assert result.evaluations != made.results[0].evaluations
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"seeds": [1]},
+        {"methods": {"TCMRL": {"algorithm": "tcmrl", "training": {"tcmrl": {"temperature": 2.0}}}}},
+        {"methods": {"FOCAL": {"algorithm": "focal"}}},
+        {"training": experiments.SMALL | {"run": experiments.SMALL["run"] | {"steps": 20}}},
+        {"curve_points": 4},
+        {"protocols": ["idaq"]},
+    ],
+)
+def test_another_training_or_curve_is_done(
+    changes: dict[str, Any], source: tuple[Path, ExperimentReport], tiny_folder: Path, tmp_path: Path
+) -> None:
+    (result,) = run_experiment(_experiment(tiny_folder, **changes), tmp_path, reuse=[source[0]]).results
+    assert result.training_of is None
+    assert all(point.timed_steps > 0 for point in result.curve)
+
+
+def test_a_folder_without_results_is_refused(tiny_folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(CheckpointError, match="holds no results"):
+        run_experiment(_experiment(tiny_folder), tmp_path / "out", reuse=[tmp_path])
+    assert not (tmp_path / "out" / "runs").exists()
+
+
+def _tune(folder: Path, name: str, *, trials: int = 2, score: float | None = 0.5) -> None:
+    algorithm = name.rsplit("-", 1)[1]
+    values = {"optimizer.learning_rate": 0.002, f"{algorithm}.latent": 3}
+    ended = Trial(number=0, drawn={}, values={}, score=None if score is None else 0.1, error="diverged")
+    best = Trial(number=1, drawn={}, values=values, score=score, error=None if score else "diverged")
+    blank = Tuning(
+        algorithm=algorithm,
+        environment="point-robot",
+        profile="quick",
+        root="0" * 64,
+        seed=0,
+        seeds=(0,),
+        steps=40,
+        protocols=("offline",),
+        training_tasks=(0,),
+        held_out=(1,),
+        space={},
+        identity={},
+        versions={},
+    )
+    more = [Trial(number=number, drawn={}, values={}, score=0.0) for number in range(2, trials)]
+    (folder / name).mkdir(parents=True)
+    write_record(folder / name / RECORD, blank.with_trials([ended, best, *more]))
+
+
+def test_tuned_settings_lie_between_the_environments_changes_and_the_methods_own(
+    tiny_folder: Path, tmp_path: Path
+) -> None:
+    _tune(tmp_path, "point-robot-tcmrl")
+    methods = {
+        "tuned": {"algorithm": "tcmrl"},
+        "own": {"algorithm": "tcmrl", "training": {"tcmrl": {"latent": 5}}},
+    }
+    experiment = _experiment(tiny_folder, methods=methods)
+    found = tuned_settings(experiment, tmp_path)
+    tuned, own = plan_runs(experiment, data=tmp_path, tuned=found)
+    assert (tuned.config.settings.optimizer.learning_rate, tuned.config.method["latent"]) == (0.002, 3)
+    assert (own.config.settings.optimizer.learning_rate, own.config.method["latent"]) == (0.002, 5)
+    assert tuned.tuned == own.tuned == found["point-robot"]["tcmrl"]
+    assert (found["point-robot"]["tcmrl"].trials, found["point-robot"]["tcmrl"].score) == (2, 0.5)
+
+
+def test_an_environment_takes_the_tuning_that_it_names(tiny_folder: Path, tmp_path: Path) -> None:
+    _tune(tmp_path, "elsewhere-tcmrl")
+    places = {"point-robot": {"dataset": str(tiny_folder), "profile": "quick", "tuning": "elsewhere"}}
+    found = tuned_settings(_experiment(tiny_folder, environments=places), tmp_path)
+    assert found["point-robot"]["tcmrl"].overrides[0] == "optimizer.learning_rate=0.002"
+
+
+def test_missing_unequal_and_failed_tunings_are_refused(
+    tiny_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    both = METHODS | {"FOCAL": {"algorithm": "focal"}}
+    _tune(tmp_path, "point-robot-tcmrl")
+    with pytest.raises(TrainingError, match=r"point-robot-focal holds no tuning; `tcmrl tune --algo focal"):
+        tuned_settings(_experiment(tiny_folder, methods=both), tmp_path)
+    _tune(tmp_path, "point-robot-focal", trials=3)
+    with pytest.raises(TrainingError, match=r"equal effort"):
+        tuned_settings(_experiment(tiny_folder, methods=both), tmp_path)
+    _tune(tmp_path / "failed", "point-robot-tcmrl", score=None)
+    with pytest.raises(TrainingError, match="no trial ended well"):
+        tuned_settings(_experiment(tiny_folder), tmp_path / "failed")
+    call: Call = in_process(tcmrl, capsys)
+    assert_refused(call("experiment", "tour", "--tuned", tmp_path / "none"), "holds no tuning")
