@@ -20,7 +20,13 @@ from tcmrl_algo.experiment.compact import compact
 from tcmrl_algo.experiment.config import read_experiment
 from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.reporting.compose import compose
-from tcmrl_algo.reporting.contexts import Stored, TrainedContexts, distance_ratio, embed
+from tcmrl_algo.reporting.contexts import (
+    Stored,
+    TrainedContexts,
+    centroid_accuracy,
+    distance_ratio,
+    embed,
+)
 from tcmrl_algo.reporting.figures import draw_embeddings
 from tcmrl_algo.reporting.sections import attention_table, final_table, published, published_table
 from tcmrl_algo.reporting.sources import FinishedRun, labels_of, read_sources
@@ -66,6 +72,12 @@ def test_contexts_within_a_task_over_contexts_between_tasks() -> None:
     assert distance_ratio(contexts, np.array([0, 0, 1, 1])) == pytest.approx(1.0 / between)
     assert distance_ratio(contexts, np.array([0, 0, 0, 0])) is None
     assert distance_ratio(np.zeros((4, 2)), np.array([0, 0, 1, 1])) is None
+
+
+def test_a_context_is_not_counted_into_the_centroid_that_it_is_compared_with() -> None:
+    """Of 4, the nearest mean is 7; if it counted into its own task's, that would be 2, which is nearer."""
+    contexts, labels = np.array([[0.0], [4.0], [7.0], [7.0]]), np.array([0, 0, 1, 1])
+    assert centroid_accuracy(contexts, labels) == pytest.approx(3 / 4)
 
 
 def test_tsne_keeps_far_groups_apart_and_repeats_itself() -> None:

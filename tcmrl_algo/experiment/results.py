@@ -94,6 +94,7 @@ class ContextMeasures(_Record):
         tasks: number of tasks with stored trajectories that were encoded.
         context_ratio: mean distance between contexts of one task over that between contexts of two tasks;
             None for a method without contexts.
+        centroid_accuracy: share of the contexts that are nearest to the mean context of their own task.
         attention_zero, attention_nonzero: mean attention to transitions without and with reward, where
             uniform attention is 1; None for a method without attention, or without both kinds.
         median_zero, median_nonzero: medians of the same.
@@ -101,6 +102,7 @@ class ContextMeasures(_Record):
 
     tasks: int
     context_ratio: float | None = None
+    centroid_accuracy: float | None = None
     attention_zero: float | None = None
     attention_nonzero: float | None = None
     median_zero: float | None = None

@@ -123,8 +123,11 @@ class TrainedContexts:
             if len(weights):
                 attention[f"attention_{kind}"] = float(weights.mean())
                 attention[f"median_{kind}"] = float(np.median(weights))
-        ratio = None if self.contexts is None else distance_ratio(self.contexts, self.labels)
-        return ContextMeasures(tasks=len(self._stored.tasks), context_ratio=ratio, **attention)
+        separation = {}
+        if self.contexts is not None:
+            separation["context_ratio"] = distance_ratio(self.contexts, self.labels)
+            separation["centroid_accuracy"] = centroid_accuracy(self.contexts, self.labels)
+        return ContextMeasures(tasks=len(self._stored.tasks), **separation, **attention)
 
 
 def distance_ratio(contexts: FloatArray, labels: IntArray) -> float | None:
@@ -142,6 +145,26 @@ def distance_ratio(contexts: FloatArray, labels: IntArray) -> float | None:
     pairs = ~np.eye(len(labels), dtype=bool)
     between = float(distances[~same].mean()) if (~same).any() else 0.0
     return float(distances[same & pairs].mean()) / between if between and (same & pairs).any() else None
+
+
+def centroid_accuracy(contexts: FloatArray, labels: IntArray) -> float:
+    """Share of the contexts whose nearest mean is that of their task's others, not that of another task.
+
+    Every task needs two contexts.
+
+    Example:
+        >>> import numpy as np
+        >>> centroid_accuracy(np.array([[0.0], [1.0], [1.5], [5.0]]), np.array([0, 0, 1, 1]))
+        0.75
+    """
+    members = np.eye(labels.max() + 1)[labels]
+    numbers = members.sum(axis=0)
+    centroids = (members.T @ contexts) / numbers[:, None]
+    distances = np.linalg.norm(contexts[:, None] - centroids[None], axis=-1)
+    size = numbers[labels]
+    rows = np.arange(len(labels))
+    distances[rows, labels] *= size / (size - 1)  # without the context itself the centroid lies farther away
+    return float((distances.argmin(axis=1) == labels).mean())
 
 
 def embed(contexts: FloatArray) -> FloatArray:

@@ -124,12 +124,19 @@ def cost_table(name: str, environment: str, results: Sequence[RunResult]) -> Tab
 
 
 def context_table(name: str, results: Sequence[RunResult]) -> Table:
-    """Mean distance of contexts of one task over that of contexts of two tasks, by method."""
+    """How well contexts of single trajectories tell the tasks apart, by method.
+
+    By the mean distance of contexts of one task over that of contexts of two tasks, and by the share of
+    contexts that are nearest to the mean context of their own task.
+    """
     rows: list[tuple[Cell, ...]] = []
     for method, runs in by_method(results).items():
-        ratios = [run.contexts.context_ratio for run in runs if run.contexts is not None]
-        rows.append((method, len(ratios), *across_seeds(ratios)[::2]))
-    return Table(name, ("method", "runs", "within / between tasks", "95% interval"), tuple(rows))
+        measured = [run.contexts for run in runs if run.contexts is not None]
+        ratios = across_seeds([contexts.context_ratio for contexts in measured])[::2]
+        accuracies = across_seeds([contexts.centroid_accuracy for contexts in measured])[::2]
+        rows.append((method, len(measured), *ratios, *accuracies))
+    columns = ("within / between tasks", "95% interval", "nearest to own centroid", "95% interval")
+    return Table(name, ("method", "runs", *columns), tuple(rows))
 
 
 def attention_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
