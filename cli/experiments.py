@@ -151,7 +151,7 @@ def experiment(
             steps=steps,
             workers=workers,
             device=device,
-            tuned=None if tuned is None else tuned_settings(loaded, tuned, environments),
+            tuned=tuned_settings(loaded, tuned, environments=environments, only=only) if tuned else None,
             reuse=reuse,
             report=lambda event: remark(_line(event), quiet=quiet),
         )

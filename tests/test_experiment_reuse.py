@@ -152,6 +152,9 @@ def test_missing_unequal_and_failed_tunings_are_refused(
     _tune(tmp_path, "point-robot-tcmrl")
     with pytest.raises(TrainingError, match=r"point-robot-focal holds no tuning; `tcmrl tune --algo focal"):
         tuned_settings(_experiment(tiny_folder, methods=both), tmp_path)
+    assert list(tuned_settings(_experiment(tiny_folder, methods=both), tmp_path, only=["TCMRL"])) == [
+        "point-robot"
+    ]
     _tune(tmp_path, "point-robot-focal", trials=3)
     with pytest.raises(TrainingError, match=r"equal effort"):
         tuned_settings(_experiment(tiny_folder, methods=both), tmp_path)

@@ -10,7 +10,7 @@ from tcmrl_data import TrainingError
 
 
 def tuned_settings(
-    experiment: Experiment, folder: str | Path, environments: Sequence[str] = ()
+    experiment: Experiment, folder: str | Path, *, environments: Sequence[str] = (), only: Sequence[str] = ()
 ) -> dict[str, dict[str, Tuned]]:
     """The best settings of every environment and algorithm of an experiment.
 
@@ -18,27 +18,29 @@ def tuned_settings(
         experiment: whose environments may name the environment of which the settings are.
         folder: of tunings, each in `ENV-ALGO`, where `tcmrl tune` puts it.
         environments: those that are wanted; all where empty.
+        only: labels of the methods that are wanted; all where empty.
 
     Raises:
         TrainingError: a method was not tuned, no trial of it ended well, or methods of an environment were
             tuned with unequal effort.
     """
+    methods = [method for label, method in experiment.methods.items() if not only or label in only]
     found = {
         environment: {
             algorithm: _tuned(Path(folder) / f"{choice.tuning or environment}-{algorithm}", algorithm)
-            for algorithm in sorted({method.algorithm for method in experiment.methods.values()})
+            for algorithm in sorted({method.algorithm for method in methods})
         }
         for environment, choice in experiment.environments.items()
         if not environments or environment in environments
     }
-    for environment, methods in found.items():
-        efforts = {name: (one.trials, one.steps, one.seeds, one.root) for name, one in methods.items()}
-        (first, effort), *others = efforts.items()
-        for name, other in others:
-            if other != effort:
+    for environment, settings in found.items():
+        efforts = [(name, (one.trials, one.steps, one.seeds, one.root)) for name, one in settings.items()]
+        for name, effort in efforts[1:]:
+            first, expected = efforts[0]
+            if effort != expected:
                 raise TrainingError(
-                    f"{folder}: {first} was tuned for {environment} by {_effort(methods[first])}, {name} by "
-                    f"{_effort(methods[name])}; tune methods with equal effort to compare them"
+                    f"{folder}: {first} was tuned for {environment} by {_effort(settings[first])}, {name} by "
+                    f"{_effort(settings[name])}; tune methods with equal effort to compare them"
                 )
     return found
 
