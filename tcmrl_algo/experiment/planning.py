@@ -80,7 +80,7 @@ def plan_runs(
         seeds: instead of the experiment's.
         steps: training steps instead of `run.steps`, of runs and schedules.
         tuned: settings of environments and algorithms, which methods' own changes go over; the training
-            table's where None.
+            table's for what it does not have, or where None.
 
     Raises:
         SelectionError: a dataset is missing, of another environment or profile, without test tasks, or
@@ -96,7 +96,7 @@ def plan_runs(
     }
 
     def found(environment: str, label: str) -> Tuned | None:
-        return None if tuned is None else tuned[environment][experiment.methods[label].algorithm]
+        return None if tuned is None else tuned[environment].get(experiment.methods[label].algorithm)
 
     configs = {
         environment: {
