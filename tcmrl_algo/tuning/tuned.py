@@ -18,17 +18,20 @@ def tuned_settings(
         experiment: whose environments may name the environment of which the settings are.
         folder: of tunings, each in `ENV-ALGO`, where `tcmrl tune` puts it.
         environments: those that are wanted; all where empty.
-        only: labels of the methods that are wanted; all where empty.
+        only: labels of the methods that must be tuned; all where empty. Others may be.
 
     Raises:
         TrainingError: a method was not tuned, no trial of it ended well, or methods of an environment were
             tuned with unequal effort.
     """
-    methods = [method for label, method in experiment.methods.items() if not only or label in only]
+    methods = experiment.methods.items()
+    wanted = {method.algorithm for label, method in methods if not only or label in only}
     found = {
         environment: {
-            algorithm: _tuned(Path(folder) / f"{choice.tuning or environment}-{algorithm}", algorithm)
-            for algorithm in sorted({method.algorithm for method in methods})
+            algorithm: _tuned(place, algorithm)
+            for algorithm in sorted({method.algorithm for _, method in methods})
+            for place in [Path(folder) / f"{choice.tuning or environment}-{algorithm}"]
+            if algorithm in wanted or (place / RECORD).is_file()
         }
         for environment, choice in experiment.environments.items()
         if not environments or environment in environments
