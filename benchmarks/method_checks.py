@@ -1,0 +1,151 @@
+"""Whether methods do what their papers say of them: `python benchmarks/method_checks.py results/table2`.
+
+Reads the finished runs of an experiment in one environment and prints JSON, of every method the mean over
+its runs:
+
+- CSRO: the share of the variance of representations z_t that a linear function of (s_t, a_t) explains, on
+  other trajectories than those it was fitted on. Its penalty is to lower it.
+- UNICORN: the mean squared error of rewards that the decoder predicts from a task's own context, and from the
+  context of another task.
+- MACAW: the return of the policy that training starts tasks from, and after one inner step on stored
+  trajectories.
+- BOReL: the mean variance of the belief before the first step of a stored lane, and after others.
+
+Contexts and rewards are of the test tasks' stored trajectories; contexts are of other trajectories than the
+rewards that are predicted from them.
+"""
+
+import argparse
+import json
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from tcmrl_algo import ContextAlgorithm, create_algorithm
+from tcmrl_algo.adaptation.arena import Arena, Context
+from tcmrl_algo.algorithms.borel.borel import BorelLearner, joined_episodes
+from tcmrl_algo.algorithms.csro import CsroLearner
+from tcmrl_algo.algorithms.macaw.macaw import MacawLearner
+from tcmrl_algo.algorithms.unicorn import UnicornLearner
+from tcmrl_algo.reporting.sources import FinishedRun, read_sources
+from tcmrl_algo.training.checkpoint import RunRecord, open_run
+from tcmrl_algo.training.config import method_of
+from tcmrl_data import Dataset, Steps, Trajectory
+
+TRAJECTORIES = 20
+"""Stored trajectories of every task, half of them for contexts or fits."""
+Values = dict[str, float]
+
+
+def explained_by_states_and_actions(learner: CsroLearner, fitted_on: Steps, steps: Steps) -> Values:
+    """CSRO: the explained share of the variance of representations."""
+    (first_inputs, first), (inputs, outputs) = (_rows(learner, part) for part in (fitted_on, steps))
+    errors = outputs - inputs @ torch.linalg.lstsq(first_inputs, first).solution
+    share = 1.0 - float(errors.square().sum() / (outputs - outputs.mean(dim=0)).square().sum())
+    return {"explained": share}
+
+
+def _rows(learner: CsroLearner, steps: Steps) -> tuple[Tensor, Tensor]:
+    """(s, a, 1) and z of all transitions."""
+    read = learner.encoder.read(steps)
+    (representations,) = learner.encoder(read)
+    inputs = read.state_actions[steps.mask]
+    return torch.cat([inputs, torch.ones(len(inputs), 1)], dim=1), representations[steps.mask]
+
+
+def reward_errors(learner: UnicornLearner, context_steps: Steps, steps: Steps) -> Values:
+    """UNICORN: errors of the reward decoder under a task's own context and under another's."""
+    own = learner.context(context_steps)
+    read = learner.encoder.read(steps)
+    mask = steps.mask.flatten(1)
+
+    def error(context: Tensor) -> float:
+        spread = context.unsqueeze(1).expand(-1, mask.shape[1], -1)
+        inputs = torch.cat([spread, read.state_actions.flatten(1, 2)], dim=-1)
+        rewards, _ = learner.reward_decoder(inputs)
+        return float((rewards - read.outcomes.flatten(1, 2)[..., :1])[mask].square().mean())
+
+    others = [error(own.roll(shift, dims=0)) for shift in range(1, len(own))]
+    return {"own": error(own), "another": fmean(others)}
+
+
+def gain_of_inner_step(algorithm: MacawLearner, dataset: Dataset, record: RunRecord) -> Values:
+    """MACAW: returns before and after the inner step."""
+    method, _ = method_of(record.config)
+    settings = record.config.settings.run
+    arena = Arena(dataset, algorithm, settings, capabilities=method.capabilities, seed=record.seed)
+    tasks = dataset.test_tasks
+
+    def mean_return(contexts: list[Context]) -> float:
+        episodes = arena.adapted(tasks, contexts, episode=0)
+        return fmean(float(episode.rewards.sum()) for episode in episodes)
+
+    try:
+        return {
+            "before": mean_return([[] for _ in tasks]),
+            "after": mean_return([arena.stored(task, draw=0) for task in tasks]),
+        }
+    finally:
+        arena.close()
+
+
+def variances(learner: BorelLearner, steps: Steps, *, episodes: int) -> Values:
+    """BOReL: variances of beliefs along lanes of as many trajectories as it was trained on."""
+    found = learner.beliefs(joined_episodes(steps, episodes))[1].log_variances.exp().mean(dim=-1)
+    length = steps.mask.shape[-1]
+    places = sorted({0, 1, *range(length // 4, episodes * length + 1, length // 4)})
+    return {f"after {place} steps": float(found[:, place].mean()) for place in places}
+
+
+def checks(run: FinishedRun) -> Values | None:
+    """The check of a finished run's method; None for a method without one."""
+    opened = open_run(run.folder)
+    dataset = opened.open_dataset()
+    algorithm = create_algorithm(opened.record, dataset)
+    algorithm.load_tensors(opened.newest().tensors())
+    if isinstance(algorithm, MacawLearner):
+        return gain_of_inner_step(algorithm, dataset, opened.record)
+    if not isinstance(algorithm, ContextAlgorithm):
+        return None
+    halves: tuple[list[list[Trajectory]], ...] = ([], [])
+    for task in dataset.test_tasks:
+        stored = dataset.select(tasks=[task.index]).trajectories(task.index)
+        chosen = stored[:: max(1, len(stored) // TRAJECTORIES)][:TRAJECTORIES]
+        for half, place in zip(halves, (0, 1), strict=True):
+            half.append(chosen[place::2])
+    first, second = (algorithm.pack(half) for half in halves)
+    match algorithm.learner:
+        case CsroLearner():
+            return explained_by_states_and_actions(algorithm.learner, first, second)
+        case UnicornLearner():
+            return reward_errors(algorithm.learner, first, second)
+        case BorelLearner():
+            episodes = opened.record.config.method["episodes_per_belief"]
+            return variances(algorithm.learner, second, episodes=episodes)
+    return None
+
+
+def main() -> None:
+    """Prints the checks of all methods that have one."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("results", type=Path, help="results folder of an experiment")
+    parser.add_argument("--environment", default="point-robot")
+    arguments = parser.parse_args()
+    torch.set_grad_enabled(False)
+    found: dict[str, list[Values]] = {}
+    (source,) = read_sources([arguments.results], lambda *progress: None)
+    for run in source.of(arguments.environment):
+        values = checks(run)
+        if values is not None:
+            found.setdefault(run.result.label, []).append(values)
+    means = {
+        label: {name: round(fmean(one[name] for one in runs), 4) for name in runs[0]} | {"runs": len(runs)}
+        for label, runs in found.items()
+    }
+    print(json.dumps({"environment": arguments.environment, "methods": means}, indent=1))
+
+
+if __name__ == "__main__":
+    main()
