@@ -78,6 +78,7 @@ def test_a_context_is_not_counted_into_the_centroid_that_it_is_compared_with() -
     """Of 4, the nearest mean is 7; if it counted into its own task's, that would be 2, which is nearer."""
     contexts, labels = np.array([[0.0], [4.0], [7.0], [7.0]]), np.array([0, 0, 1, 1])
     assert centroid_accuracy(contexts, labels) == pytest.approx(3 / 4)
+    assert centroid_accuracy(contexts[:3], labels[:3]) is None
 
 
 def test_tsne_keeps_far_groups_apart_and_repeats_itself() -> None:

@@ -147,10 +147,10 @@ def distance_ratio(contexts: FloatArray, labels: IntArray) -> float | None:
     return float(distances[same & pairs].mean()) / between if between and (same & pairs).any() else None
 
 
-def centroid_accuracy(contexts: FloatArray, labels: IntArray) -> float:
+def centroid_accuracy(contexts: FloatArray, labels: IntArray) -> float | None:
     """Share of the contexts whose nearest mean is that of their task's others, not that of another task.
 
-    Every task needs two contexts.
+    None if a task has one context only.
 
     Example:
         >>> import numpy as np
@@ -159,6 +159,8 @@ def centroid_accuracy(contexts: FloatArray, labels: IntArray) -> float:
     """
     members = np.eye(labels.max() + 1)[labels]
     numbers = members.sum(axis=0)
+    if numbers.min() < 2:
+        return None
     centroids = (members.T @ contexts) / numbers[:, None]
     distances = np.linalg.norm(contexts[:, None] - centroids[None], axis=-1)
     size = numbers[labels]
