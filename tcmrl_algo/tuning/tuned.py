@@ -18,7 +18,7 @@ def tuned_settings(
         experiment: whose environments may name the environment of which the settings are.
         folder: of tunings, each in `ENV-ALGO`, where `tcmrl tune` puts it.
         environments: those that are wanted; all where empty.
-        only: labels of the methods that must be tuned, all where empty; of others, tunings that exist are read.
+        only: labels of the methods that must be tuned; all where empty. Of others, those that exist are read.
 
     Raises:
         TrainingError: a method was not tuned, no trial of it ended well, or methods of an environment were
