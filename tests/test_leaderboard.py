@@ -2,6 +2,7 @@
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,17 @@ def _sources(*folders: Path) -> list[Source]:
 
 def _labels(board: Board) -> list[str]:
     return [entry.label for entry in board.entries]
+
+
+def test_missing_runs_are_counted_by_method_or_environment_and_failed_ones_named(tmp_path: Path) -> None:
+    (source,) = _sources(_experiment(tmp_path, "one", _runs("A", 1.0)))
+    runs = [("point-robot", "B", 1), ("point-robot", "B", 2), ("ml1/reach", "A", 0), ("ml1/reach", "B", 0)]
+    unfinished = {run_id(*run): None for run in runs} | {run_id("point-robot", "A", 1): "diverged"}
+    assert replace(source, unfinished=unfinished).missing == [
+        "`point-robot--a--seed1` (diverged)",
+        "2 of `point-robot--b`",
+        "2 of `ml1-reach`",
+    ]
 
 
 def test_equal_returns_share_a_rank_and_privileged_methods_have_none() -> None:

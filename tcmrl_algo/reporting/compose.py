@@ -135,7 +135,9 @@ def _add_experiment(
     page.text(f"## {source.experiment.title}")
     page.text(f"Experiment `{source.experiment.name}` (source: {source.experiment.source}).")
     if source.missing:
-        page.text(f"Results are missing for {len(source.missing)} of its runs, {', '.join(source.missing)}.")
+        page.text(
+            f"Results are missing for {len(source.unfinished)} of its runs: {', '.join(source.missing)}."
+        )
     if verdicts:
         page.text("### Claims")
         if alone:

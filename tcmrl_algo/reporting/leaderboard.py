@@ -88,7 +88,9 @@ def leaderboard(sources: Sequence[Source], out: Path) -> Page:
     page.text("# Leaderboard")
     page.text(NOTE)
     missing = [
-        f"`{source.experiment.name}` lacks {len(source.missing)}" for source in sources if source.missing
+        f"`{source.experiment.name}` lacks {len(source.unfinished)}"
+        for source in sources
+        if source.unfinished
     ]
     if missing:
         page.text(f"Runs are missing: {', '.join(missing)}.")

@@ -2,13 +2,14 @@
 
 import itertools
 import re
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from tcmrl_algo.adaptation.evaluate import evaluate_run
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
-from tcmrl_algo.experiment.config import Experiment, experiment_of, read_experiment, run_id
+from tcmrl_algo.experiment.config import Experiment, experiment_of, folder_name, read_experiment, run_id
 from tcmrl_algo.experiment.results import AGAIN, RunResult, error_file, read_results, result_file
 from tcmrl_algo.reporting.returns import DatasetReturns
 from tcmrl_algo.training.checkpoint import Run, open_run, tensors_digest
@@ -52,10 +53,15 @@ class Source:
 
     @property
     def missing(self) -> list[str]:
-        """The unfinished runs as text, with their errors."""
-        return [
-            f"`{name}`{'' if error is None else f' ({error})'}" for name, error in self.unfinished.items()
-        ]
+        """The unfinished runs as text: those that failed with their errors, the others counted.
+
+        Others are counted by method, and by environment where no run in it is finished.
+        """
+        reached = {folder_name(environment) for environment in self.environments()}
+        silent = [name.split("--") for name, error in self.unfinished.items() if error is None]
+        numbers = Counter("--".join(parts[: 2 if parts[0] in reached else 1]) for parts in silent)
+        failed = [f"`{name}` ({error})" for name, error in self.failed.items()]
+        return [*failed, *(f"{number} of `{place}`" for place, number in numbers.items())]
 
     def environments(self) -> list[str]:
         """Environments with finished runs."""
