@@ -244,7 +244,7 @@ def test_a_report_names_the_runs_that_are_missing_and_why(copy: Path) -> None:
     (lost / "error.txt").write_text("loss/critic is not finite at step 7\n")
     report = write_report([copy], copy / "report")
     text = report.report.read_text()
-    assert f"1 of its runs, `{lost.name}` (loss/critic is not finite at step 7)" in text
+    assert f"1 of its runs: `{lost.name}` (loss/critic is not finite at step 7)" in text
     assert [verdict.pairs for verdict in report.verdicts] == [(), (), ()]  # no run, no checkpoint
 
 

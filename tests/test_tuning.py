@@ -276,7 +276,10 @@ def test_without_optuna_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_a_space_lies_around_the_tables_values(tiny: Dataset) -> None:
     config = resolve_for(
-        tiny, profile="quick", algorithm="tcmrl", overrides=["tcmrl.weights.negative=0.3", "batch.tasks=4"]
+        tiny,
+        profile="quick",
+        algorithm="tcmrl",
+        overrides=["tcmrl.weights.negative=0.3", "optimizer.learning_rate=1e-3"],
     )
     space = space_on(
         config,
