@@ -21,6 +21,7 @@ from .frame import (
     same_command,
     stopped_by_signals,
 )
+from .options import PROCESSES
 from .places import complete_environments, complete_recipe_keys
 from .plugins import BEHAVIOR, ENGINE
 from .progress import StageProgress
@@ -67,9 +68,7 @@ def recipe_options(command: Command) -> Command:
             help="Indices of tasks, such as 0-9,12.",
         ),
         set_option,
-        click.option(
-            "--workers", type=click.IntRange(min=1), show_default="all cores", help="Number of processes."
-        ),
+        PROCESSES,
         click.option(
             "--engine",
             default="local",

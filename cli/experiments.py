@@ -22,6 +22,7 @@ from .frame import (
     same_command,
     stopped_by_signals,
 )
+from .options import DEVICE, SIMULTANEOUS_RUNS
 from .places import complete_experiments
 from .progress import StageProgress
 
@@ -51,9 +52,7 @@ NUM_SEEDS = 10_000
     metavar="FOLDER",
     help="Folder that contains a dataset per environment, under its name; or one dataset.",
 )
-@click.option(
-    "--workers", type=click.IntRange(min=1), show_default="one per core", help="Number of simultaneous runs."
-)
+@SIMULTANEOUS_RUNS
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
@@ -87,7 +86,7 @@ NUM_SEEDS = 10_000
     metavar="RESULTS",
     help="Take over equal trainings of another results folder; repeatable.",
 )
-@click.option("--device", default="cpu", show_default=True, help="PyTorch device, such as cpu or cuda.")
+@DEVICE
 @output_options
 def experiment(
     name: str | None,

@@ -8,6 +8,7 @@ import click
 from tcmrl_data.foundation.plain_files import printable
 
 from .frame import output_options, print_json
+from .options import PROCESSES
 from .places import DATASET_PATH
 from .progress import with_progress
 
@@ -48,7 +49,7 @@ DATASET = click.argument("dataset", type=DATASET_PATH)
 )
 @click.option("--out", type=click.Path(path_type=Path), metavar="FOLDER", help="Make a new dataset.")
 @click.option("--allow-drift", is_flag=True, help="Go on although the parts are from another platform.")
-@click.option("--workers", type=click.IntRange(min=1), show_default="all cores", help="Number of processes.")
+@PROCESSES
 @click.option("--dry-run", is_flag=True, help="Check and count only.")
 @output_options
 def extend(
@@ -140,7 +141,7 @@ def extend(
 @click.option("--run", default="relabelled", show_default=True, metavar="RUN", help="Name of the new run.")
 @click.option("--allow-test", is_flag=True, help="Take test tasks too; training refuses what comes of them.")
 @click.option("--label", help="The new dataset's own name.")
-@click.option("--workers", type=click.IntRange(min=1), show_default="all cores", help="Number of processes.")
+@PROCESSES
 @click.option("--dry-run", is_flag=True, help="Check, count, and try one episode per task only.")
 @output_options
 def relabel(

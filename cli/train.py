@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcmrl_data.recipe.profile import PROFILES, Profile
+from tcmrl_data.recipe.profile import Profile
 
 from .completion import completion
 from .controls import controls
@@ -21,7 +21,8 @@ from .frame import (
     stopped_by_signals,
     typed_command,
 )
-from .places import DATASET_PATH, complete_training_keys
+from .options import TRAINING_PROFILE, TRAINING_SETTINGS
+from .places import DATASET_PATH
 from .plugins import ALGORITHM
 from .progress import StageProgress
 from .reports import report
@@ -68,12 +69,7 @@ tcmrl.add_command(tune)
 @tcmrl.command()
 @click.argument("manifest", metavar="MANIFEST", type=DATASET_PATH)
 @click.option("--algo", type=ALGORITHM, show_default="the recipe's", help="Method to train.")
-@click.option(
-    "--profile",
-    type=click.Choice(PROFILES),
-    show_default="the dataset's",
-    help="Profile of the training settings.",
-)
+@TRAINING_PROFILE
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
@@ -87,14 +83,7 @@ tcmrl.add_command(tune)
     show_default="half of the available memory",
     help="Size such as 2G; larger data are read through the cache.",
 )
-@click.option(
-    "--set",
-    "overrides",
-    shell_complete=complete_training_keys,
-    metavar="SECTION.KEY=VALUE",
-    multiple=True,
-    help="Override a training setting; repeatable.",
-)
+@TRAINING_SETTINGS
 @click.option("--resume", is_flag=True, help="Continue from the newest checkpoint in --out.")
 @click.option("--seed", type=click.IntRange(min=0), show_default="0", help="Seed of all random numbers.")
 @click.option(

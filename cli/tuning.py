@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tcmrl_data.recipe.profile import PROFILES, Profile
+from tcmrl_data.recipe.profile import Profile
 
 from .experiments import NUM_SEEDS
 from .frame import (
@@ -20,7 +20,8 @@ from .frame import (
     same_command,
     stopped_by_signals,
 )
-from .places import DATASET_PATH, complete_training_keys
+from .options import DEVICE, SIMULTANEOUS_RUNS, TRAINING_PROFILE, TRAINING_SETTINGS
+from .places import DATASET_PATH
 from .plugins import ALGORITHM, PROTOCOL_NAME
 
 if TYPE_CHECKING:
@@ -45,12 +46,7 @@ if TYPE_CHECKING:
     show_default="tuning/ENV-ALGO",
     help="Folder of the trials.",
 )
-@click.option(
-    "--profile",
-    type=click.Choice(PROFILES),
-    show_default="the dataset's",
-    help="Profile of the training settings.",
-)
+@TRAINING_PROFILE
 @click.option(
     "--steps",
     type=click.IntRange(min=1),
@@ -75,18 +71,9 @@ if TYPE_CHECKING:
     show_default="paper, offline, idaq",
     help="Adaptation protocol of the score, which is their mean; repeatable.",
 )
-@click.option(
-    "--set",
-    "overrides",
-    shell_complete=complete_training_keys,
-    metavar="SECTION.KEY=VALUE",
-    multiple=True,
-    help="Override a training setting in all trials; repeatable.",
-)
-@click.option(
-    "--workers", type=click.IntRange(min=1), show_default="one per core", help="Number of simultaneous runs."
-)
-@click.option("--device", default="cpu", show_default=True, help="PyTorch device, such as cpu or cuda.")
+@TRAINING_SETTINGS
+@SIMULTANEOUS_RUNS
+@DEVICE
 @output_options
 def tune(
     manifest: Path,

@@ -11,6 +11,7 @@ from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.sizes import size
 
 from .frame import duration, fail_incomplete, output_options, print_json
+from .options import PROCESSES
 from .places import DATASET_PATH
 from .progress import StageProgress
 
@@ -105,7 +106,7 @@ def verify(
 @click.command()
 @DATASET
 @click.option("--deep", is_flag=True, help="Check as `verify --deep` does.")
-@click.option("--workers", type=click.IntRange(min=1), show_default="all cores", help="Number of processes.")
+@PROCESSES
 @output_options
 def repair(dataset: Path, as_json: bool, quiet: bool, deep: bool, workers: int | None) -> None:
     """Regenerate the damaged parts of DATASET.
