@@ -16,6 +16,7 @@ import click
 
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.threads import sleep_soon
 from tcmrl_data.foundation.torch_compiler import leave_out_compiler
 
 if TYPE_CHECKING:
@@ -47,6 +48,7 @@ def main_program(command: click.Command) -> NoReturn:
     Further signals are ignored, because they would interrupt the cleanup.
     """
     leave_out_compiler()
+    sleep_soon()
     obeyed = False
 
     def interrupt(number: int, frame: FrameType | None) -> None:
