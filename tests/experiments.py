@@ -93,6 +93,14 @@ def made_result(
     return RunResult(**(fields | changes))
 
 
+def with_setting(result: RunResult, section: str, **values: Any) -> RunResult:
+    """The result with other values in a section that all methods share."""
+    settings = result.config.settings
+    changed = getattr(settings, section).model_copy(update=values)
+    config = result.config.model_copy(update={"settings": settings.model_copy(update={section: changed})})
+    return result.model_copy(update={"config": config})
+
+
 def write_results(folder: Path, content: dict[str, Any], results: list[RunResult]) -> Path:
     """A results folder of an experiment with such results."""
     experiment = read_experiment(content, place="test")

@@ -9,7 +9,7 @@ from tcmrl_algo.experiment.results import ContextMeasures, RunResult, coverage
 from tcmrl_algo.reporting.claims import Verdict, compare, correct, judge, measure
 from tcmrl_algo.reporting.sources import FinishedRun, Source
 from tests import experiments
-from tests.experiments import made_result
+from tests.experiments import made_result, with_setting
 
 NOISE = [-100.0, 50.0, 3.0, 77.0, -20.0]
 
@@ -72,6 +72,16 @@ def test_a_verdict_marks_a_method_that_observes_task_parameters() -> None:
     control = [result.model_copy(update={"privileged": True}) for result in _runs("B", [1.0, 2.0])]
     found = _judge(Claim(text="", better="A", worse="B"), [*_runs("A", [1.0, 2.0]), *control])
     assert found.comparison == "A (final) against B (privileged) (final)"
+
+
+def test_a_verdict_names_the_shared_settings_in_which_methods_differ() -> None:
+    alike = _runs("A", [1.0, 2.0])
+    other = [with_setting(result, "actor_critic", entropy=0.5) for result in _runs("B", [0.0, 0.0])]
+    other = [with_setting(result, "run", threads=7) for result in other]
+    entropy = alike[0].config.settings.actor_critic.entropy
+    claim = Claim(text="", better="A", worse="B")
+    assert _judge(claim, [*alike, *other]).unequal == (f"`actor_critic.entropy` {entropy}, 0.5",)
+    assert _judge(claim, [*alike, *_runs("B", [0.0, 0.0])]).unequal == ()
 
 
 def test_one_method_under_two_metrics_makes_a_claim() -> None:

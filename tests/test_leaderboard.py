@@ -21,7 +21,7 @@ from tcmrl_algo.reporting.sources import Source, read_sources
 from tcmrl_algo.reporting.write import ignore, page_text
 from tests import experiments
 from tests.commands import in_process
-from tests.experiments import made_result, write_results
+from tests.experiments import made_result, with_setting, write_results
 
 OTHER_ROOT = "f" * 64
 
@@ -111,6 +111,14 @@ def test_one_name_with_two_settings_is_told_apart(tmp_path: Path) -> None:
     (board,) = gather(_sources(first, second))
     assert _labels(board) == ["A (first)", "A (second)"]
     assert "**Not equal on this board: steps.**" in page_text(leaderboard(_sources(first, second), tmp_path))
+
+
+def test_a_board_names_the_settings_in_which_its_methods_differ(tmp_path: Path) -> None:
+    slow = [with_setting(run, "optimizer", learning_rate=1e-5) for run in _runs("B", 2.0)]
+    first = _experiment(tmp_path, "first", [*_runs("A", 1.0), *slow])
+    assert "**Not equal on this board: `optimizer.learning_rate`.**" in page_text(
+        leaderboard(_sources(first), tmp_path)
+    )
 
 
 @pytest.fixture

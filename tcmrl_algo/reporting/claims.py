@@ -7,6 +7,7 @@ from statistics import fmean
 from tcmrl_algo.experiment.aggregate import CONFIDENCE, holm, mean_interval, sign_probability
 from tcmrl_algo.experiment.config import Claim, Metric
 from tcmrl_algo.experiment.results import RunResult, coverage
+from tcmrl_algo.reporting.fairness import unequal_settings
 from tcmrl_algo.reporting.sources import Source
 
 LOWER_IS_BETTER = frozenset({"regret", "training_seconds", "peak_memory", "context_ratio"})
@@ -33,6 +34,7 @@ class Verdict:
         probability: two-sided p value against a mean of 0, with Student's t; None as the interval.
         adjusted: the p value, corrected for all verdicts of the experiment by Holm's method.
         covers: what interval and p value cover: numbers of seeds, folds and test tasks.
+        unequal: settings that all methods share and in which these two differ, as `key left, right`.
         verdict: `supported` or `contradicted`, by the sign of the mean, if `adjusted` is below 0.05, else
             `cannot tell`.
     """
@@ -49,6 +51,7 @@ class Verdict:
     probability: float | None
     adjusted: float | None
     covers: str
+    unequal: tuple[str, ...]
     verdict: str
 
 
@@ -86,24 +89,29 @@ def compare(claim: Claim, environment: str, results: Sequence[RunResult], *, pro
     worse = _by_pair(results, claim.worse, against, protocol)
     pairs = tuple(sorted(better.keys() & worse.keys(), key=str))
     sign = -1.0 if claim.metric in LOWER_IS_BETTER else 1.0
-    differences = tuple(sign * (better[pair] - worse[pair]) for pair in pairs)
-    low, high = mean_interval(differences) or (None, None)
+    gains = tuple(sign * (better[pair] - worse[pair]) for pair in pairs)
+    low, high = mean_interval(gains) or (None, None)
     labels = {result.method: result.label for result in results}
     left, right = (labels.get(method, method) for method in (claim.better, claim.worse))
-    used = [result for result in results if result.method == claim.better and result.pair in pairs]
+    first, second = (
+        [result for result in results if result.method == method and result.pair in pairs]
+        for method in (claim.better, claim.worse)
+    )
+    unequal = unequal_settings(first[0], second[0]) if pairs else {}
     return Verdict(
         claim=claim.text,
         environment=environment,
         comparison=f"{left} ({claim.metric}) against {right} ({against})",
         protocol=protocol,
         pairs=pairs,
-        differences=differences,
-        mean=fmean(differences) if differences else None,
+        differences=gains,
+        mean=fmean(gains) if gains else None,
         low=low,
         high=high,
-        probability=sign_probability(differences),
+        probability=sign_probability(gains),
         adjusted=None,
-        covers=coverage(used),
+        covers=coverage(first),
+        unequal=tuple(f"`{key}` {one}, {other}" for key, (one, other) in unequal.items()),
         verdict=UNDECIDED,
     )
 

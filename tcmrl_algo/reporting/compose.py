@@ -31,7 +31,9 @@ Differences are taken run by run (same seed, same fold), and positive difference
 is judged under every protocol that it concerns. The 95% interval of the mean difference is by Student's t, \
 for this comparison alone. `p, corrected` is the p value of the same test after Holm's correction for all \
 verdicts of the experiment: below 0.05 a claim is supported or contradicted, by the sign of the mean. With \
-fewer than five runs there is no interval and no verdict."""
+fewer than five runs there is no interval and no verdict. `unequal settings` are those that all methods \
+share and in which the two compared differ, first and second: where a search found them, a difference may \
+be theirs."""
 ADAPTATION = """\
 Returns of the adaptation episodes of a protocol in turn, means over test tasks and runs. The first episodes \
 of `paper` act uniformly, those of the other protocols by stored or tried contexts; where the first stage is \

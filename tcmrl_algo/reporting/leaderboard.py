@@ -8,6 +8,7 @@ from statistics import fmean
 from tcmrl_algo.experiment.results import RunResult, coverage, success_rate
 from tcmrl_algo.reporting.boards import Board, Entry, gather
 from tcmrl_algo.reporting.compose import Page
+from tcmrl_algo.reporting.fairness import unequal_settings
 from tcmrl_algo.reporting.figures import draw_boards
 from tcmrl_algo.reporting.scores import SCORES, known_scores, over_dataset
 from tcmrl_algo.reporting.sources import Source, read_sources
@@ -21,6 +22,8 @@ RECORD = f"{NAME}.json"
 """Which folders a leaderboard was made of, relative to its own, so that it can be made again."""
 BASELINE = "focal"
 COSTS = ("ms per step", "over FOCAL", "peak MB")
+BUDGET = frozenset({"run.steps", "run.episodes", "run.random_episodes", "run.repeats"})
+"""Settings that have columns of their own."""
 EFFORT_COLUMNS = ("steps", "profile", "episodes", "random", "repeats", *COSTS, "tuned", "experiments")
 NOTE = """\
 Returns are undiscounted, after adaptation, means over test tasks and runs; behind them stands the 95% \
@@ -223,7 +226,7 @@ def _effort_of(entry: Entry, pace: float | None) -> tuple[Cell, ...]:
 
 
 def _differences(board: Board) -> str:
-    """What the methods of a board do not have in common."""
+    """Budgets and shared settings that the methods of a board do not have in common."""
     columns = ("steps", "episodes", "random", "repeats", "tuned")
     table = _effort(board)
     places = [table.columns.index(column) for column in columns]
@@ -232,6 +235,9 @@ def _differences(board: Board) -> str:
         for column, place in zip(columns, places, strict=True)
         if len({row[place] for row in table.rows}) > 1
     ]
+    runs = [entry.runs[0] for entry in board.entries]
+    settings = {key: None for run in runs[1:] for key in unequal_settings(runs[0], run)}
+    unequal += [f"`{key}`" for key in settings if key not in BUDGET]
     if not unequal:
         return "Budgets and tuning are equal for all methods of this board."
     return f"**Not equal on this board: {', '.join(unequal)}.** Compare with care."

@@ -73,9 +73,11 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
     for found in verdicts:
         interval = interval_text(found.differences, found.low, found.high) if found.pairs else None
         what = (found.claim, found.environment, found.comparison, found.protocol)
-        rows.append((*what, found.mean, interval, found.adjusted, found.verdict, found.covers))
+        unequal = "; ".join(found.unequal) or None
+        rows.append((*what, found.mean, interval, found.adjusted, found.verdict, unequal, found.covers))
     columns = ("claim", "environment", "compared", "protocol", "mean difference", "95% interval")
-    return Table(name, (*columns, "p, corrected", "verdict", "interval covers"), tuple(rows))
+    more = ("p, corrected", "verdict", "unequal settings", "interval covers")
+    return Table(name, (*columns, *more), tuple(rows))
 
 
 def claims_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Table:

@@ -2,10 +2,9 @@
 
 import shutil
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from tcmrl_data.build.driver import Driver
 from tcmrl_data.build.events import BuildEvent, EventLog
@@ -13,6 +12,7 @@ from tcmrl_data.build.ledger import Ledger
 from tcmrl_data.build.plan import plan_build
 from tcmrl_data.build.work_files import ASSEMBLY, WORK_FILES, WORK_FOLDERS, check_work_files
 from tcmrl_data.engine.base import ENGINES
+from tcmrl_data.foundation.canonical import differences
 from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
 from tcmrl_data.foundation.sizes import size
@@ -135,21 +135,12 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
         )
     if manifest.seed != seed:
         raise BuildError(f"{out} was built with seed {manifest.seed}, not {seed}; use another --out")
-    other = _first_difference(
-        full_settings(manifest.recipe.unit_settings()), full_settings(recipe.unit_settings())
-    )
-    if other:
-        raise BuildError(f"{out} was built with other settings: {other}; use another --out")
-
-
-def _first_difference(old: Any, new: Any, path: str = "") -> str | None:
-    if isinstance(old, Mapping) and isinstance(new, Mapping):
-        for key in sorted({*old, *new}):
-            found = _first_difference(old.get(key), new.get(key), f"{path}.{key}" if path else key)
-            if found:
-                return found
-        return None
-    return None if old == new else f"{path} is {old} there and {new} here"
+    old, new = (full_settings(of.unit_settings()) for of in (manifest.recipe, recipe))
+    for place, there, here in differences(old, new):
+        raise BuildError(
+            f"{out} was built with other settings: {place} is {there} there and {here} here; "
+            "use another --out"
+        )
 
 
 def _check_space(out: Path, needed: int, num_parts: int) -> None:

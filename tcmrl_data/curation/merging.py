@@ -9,7 +9,7 @@ from tcmrl_data.curation.assembly import derivation_of
 from tcmrl_data.curation.plan import Plan, PlannedPart, settle_runs
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.tasks import Split, Task
-from tcmrl_data.foundation.canonical import canonical_json, digest
+from tcmrl_data.foundation.canonical import canonical_json, differences, digest
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.recipe.about import merged_about
 from tcmrl_data.store.keys import MAIN_RUN, RUN_NAME, PartKey
@@ -137,7 +137,7 @@ def _check(sources: Sequence[Dataset]) -> None:
         if not source.manifest.complete:
             raise SelectionError(f"{source.path} is incomplete; finish it with `tcmrl-data build` first")
         found = {name: _common(dataset) for name, dataset in (("left", first), ("right", source))}
-        for name, left, right in _differences(found["left"], found["right"]):
+        for name, left, right in differences(found["left"], found["right"]):
             raise SelectionError(
                 f"{name} differs: {left} in {first.path} and {right} in {source.path}; only datasets of one "
                 "environment and one set of tasks can be merged"
@@ -148,16 +148,6 @@ def _common(source: Dataset) -> dict[str, Any]:
     """What all sources must have in common."""
     environment = source.manifest.recipe.environment.model_dump(mode="json")
     return {"environment": environment, "data_version": source.manifest.data_version}
-
-
-def _differences(left: Any, right: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
-    """Place and both values of everything that differs in two JSON values."""
-    if isinstance(left, Mapping) and isinstance(right, Mapping):
-        for name in sorted({*left, *right}):
-            inner = f"{place}.{name}" if place else str(name)
-            yield from _differences(left.get(name), right.get(name), inner)
-    elif left != right:
-        yield place, left, right
 
 
 def _tasks(sources: Sequence[Dataset], split_from: str | None) -> tuple[tuple[Task, ...], dict[int, Split]]:
@@ -174,7 +164,7 @@ def _tasks(sources: Sequence[Dataset], split_from: str | None) -> tuple[tuple[Ta
         own = derivation.split_of_tasks() if derivation else {}
         for task in source.tasks:
             known, owner = found.setdefault(task.index, (task, source))
-            for name, left, right in _differences(dict(known.parameters), dict(task.parameters)):
+            for name, left, right in differences(dict(known.parameters), dict(task.parameters)):
                 raise SelectionError(
                     f"task {task.index}: {name} differs: {left} in {owner.path} and {right} in {source.path}"
                 )

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import math
+from collections.abc import Iterator, Mapping
 from typing import Any, NoReturn
 
 MAX_JSON_BYTES = 16 * 2**20
@@ -27,6 +28,19 @@ def sha256(data: bytes | memoryview) -> str:
 def digest(value: Any) -> str:
     """The sha256 of a value's canonical JSON, in hexadecimal."""
     return sha256(canonical_json(value))
+
+
+def differences(left: Any, right: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Place, such as `sac.steps`, and both values of everything that differs in two JSON values.
+
+    A key that one object lacks has the value None there; lists are compared whole.
+    """
+    if isinstance(left, Mapping) and isinstance(right, Mapping):
+        for name in sorted({*left, *right}):
+            inner = f"{place}.{name}" if place else str(name)
+            yield from differences(left.get(name), right.get(name), inner)
+    elif left != right:
+        yield place, left, right
 
 
 def parse_json(data: bytes) -> Any:
