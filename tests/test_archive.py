@@ -16,7 +16,7 @@ from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.store import archive as module
 from tcmrl_data.store.archive import MOST_MEMBERS, Archive, pack_archive
 from tcmrl_data.store.arrays import encode_arrays
-from tests.forged_archives import FILES, FORGED, HONEST, INNER, START, forge, zipped
+from tests.hostile.archives import FILES, FORGED, HONEST, INNER, START, forge, zipped
 
 names = st.from_regex(r"[a-z0-9_][a-z0-9_.]{0,5}(/[a-z0-9_][a-z0-9_.]{0,5}){0,3}", fullmatch=True)
 contents = st.dictionaries(names, st.binary(max_size=300), max_size=6)

@@ -20,19 +20,14 @@ import tcmrl_data
 from tcmrl_data import TcmrlError, open_dataset, verify_dataset
 from tcmrl_data.verification import making_again
 from tcmrl_data.verification.findings import Finding
-from tests.forged_datasets import FORGED_TASKS, Forge, base, copies_of
-from tests.hostile_corpus import (
-    ARCHIVES,
-    CASES,
-    CHUNKS,
-    FILES,
-    MANIFESTS,
-    PART_TABLES,
-    PLACES,
-    RECORDS,
-    TASK_TABLES,
-    Case,
-)
+from tests.hostile.arrays import CHUNKS
+from tests.hostile.case import Case
+from tests.hostile.corpus import CASES
+from tests.hostile.datasets import FORGED_TASKS, Forge, base, copies_of
+from tests.hostile.files import FILES
+from tests.hostile.manifests import MANIFESTS
+from tests.hostile.records import ARCHIVES, RECORDS
+from tests.hostile.tables import PART_TABLES, PLACES, TASK_TABLES
 
 MEMORY_FLOOR = 64 * 2**20
 MEMORY_RATIO = 8

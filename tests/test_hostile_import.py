@@ -11,15 +11,18 @@ from types import FrameType
 import pytest
 
 from tcmrl_data import TcmrlError, import_dataset
-from tests.hostile_imports import CASES as WITHOUT_EXTRAS
-from tests.hostile_imports import FORMATS, Places, hdf5, minari
-from tests.hostile_parquet import PARQUET, columns, written
+from tests.hostile.hdf5 import HDF5, hdf5
+from tests.hostile.minari import MINARI, minari
+from tests.hostile.npy import IDAQ
+from tests.hostile.parquet import PARQUET, columns, written
+from tests.hostile.source import Places
 from tests.made_up import trajectory
 from tests.test_import_idaq import saved
 
 MEMORY_FLOOR, MEMORY_RATIO = 64 * 2**20, 2
 ADDRESS_SPACE = 2**30
-CASES = WITHOUT_EXTRAS | (PARQUET if importlib.util.find_spec("pyarrow") else {})
+CASES = IDAQ | HDF5 | MINARI | (PARQUET if importlib.util.find_spec("pyarrow") else {})
+FORMATS = {"npy": "idaq-npy", "hdf5": "hdf5", "minari": "minari", "parquet": "parquet"}
 SECONDS = 120
 
 

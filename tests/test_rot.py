@@ -15,7 +15,7 @@ from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import making_again
-from tests.forged_datasets import base, copies_of
+from tests.hostile.datasets import base, copies_of
 
 BYTES = {MANIFEST, TASKS, PARTS_TABLE}
 

@@ -26,7 +26,7 @@ from tcmrl_data.store.tables import read_lines
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import replay as replay_module
 from tests.damage import data_files, found, rot
-from tests.forged_datasets import PART, STEP, Forge, base
+from tests.hostile.datasets import PART, STEP, Forge, base
 
 Copy = Callable[[], Path]
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from tcmrl_data.interchange.readers.thrift import CompactReader
-from tests.hostile_imports import Make, Places
+from tests.hostile.source import Make, Places
 
 Record = dict[int, Any]
 

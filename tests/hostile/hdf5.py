@@ -1,0 +1,210 @@
+"""Forged HDF5 files for `tcmrl-data import`, each with one attack."""
+
+import json
+import os
+import struct
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from tests.hostile.source import TEBI, Make, Places
+
+FLAT = {
+    "observations": np.zeros((64, 2), dtype=np.float32),
+    "next_observations": np.zeros((64, 2), dtype=np.float32),
+    "actions": np.zeros((64, 1), dtype=np.float32),
+    "rewards": np.zeros(64, dtype=np.float32),
+    "terminals": np.zeros(64, dtype=bool),
+}
+
+
+def hdf5(change: Callable[[h5py.File, Places], object], *, without: str = "observations") -> Make:
+    """A sound file in which something takes the place of the observations."""
+
+    def make(places: Places) -> Path:
+        places.folder.mkdir(exist_ok=True)
+        path = places.folder / "flat.hdf5"
+        with h5py.File(path, "w") as file:
+            for name, array in FLAT.items():
+                if name != without:
+                    file[name] = array
+            change(file, places)
+        return path
+
+    return make
+
+
+def secret_file(places: Places) -> str:
+    with h5py.File(places.secret, "w") as file:
+        file["observations"] = FLAT["observations"]
+    return str(places.secret)
+
+
+def virtual(file: h5py.File, places: Places) -> None:
+    layout = h5py.VirtualLayout((64, 2), dtype=np.float32)
+    layout[:] = h5py.VirtualSource(secret_file(places), "observations", (64, 2))
+    file.create_virtual_dataset("observations", layout)
+
+
+def external(file: h5py.File, places: Places) -> None:
+    places.secret.write_bytes(bytes(512))
+    file.create_dataset("observations", (64, 2), np.float32, external=[(str(places.secret), 0, 512)])
+
+
+def overfull_chunk(file: h5py.File, places: Places) -> None:
+    """A chunk that says 512 bytes and unpacks to 256 MiB."""
+    made = file.create_dataset("observations", (64, 2), np.float32, chunks=(64, 2), compression="gzip")
+    made.id.write_direct_chunk((0, 0), zlib.compress(bytes(2**28), 9))
+
+
+def looped(places: Places) -> Path:
+    """Our own layout, in which a million episodes are one: groups that hold themselves."""
+    places.folder.mkdir()
+    path = places.folder / "ours.hdf5"
+    with h5py.File(path, "w") as file:
+        file.attrs.update({"format": "tcmrl-hdf5", "format_version": 1, "task": 0, "split": "train"})
+        file.attrs["parameters"] = "{}"
+        first = file.create_group("episodes/000000")
+        first.attrs["step"] = 0
+        arrays = {
+            "observations": np.zeros((20_001, 2), dtype=np.float32),
+            "actions": np.zeros((20_000, 1), dtype=np.float32),
+            "rewards": np.zeros(20_000, dtype=np.float32),
+            "terminated": np.zeros(20_000, dtype=bool),
+            "truncated": np.zeros(20_000, dtype=bool),
+        }
+        for name, array in arrays.items():
+            first.create_dataset(name, data=array, compression="gzip")
+        for number in range(1, 2_000):
+            file[f"episodes/{number:06d}"] = first
+    return path
+
+
+def ours(**attributes: Any) -> Make:
+    def make(places: Places) -> Path:
+        places.folder.mkdir()
+        path = places.folder / "ours.hdf5"
+        with h5py.File(path, "w") as file:
+            plain = {
+                "format": "tcmrl-hdf5",
+                "format_version": 1,
+                "task": 0,
+                "split": "train",
+                "parameters": "{}",
+            }
+            file.attrs.update(plain | {name: value for name, value in attributes.items() if name != "step"})
+            group = file.create_group("episodes/000000")
+            group.attrs["step"] = attributes.get("step", 0)
+            ended = np.array([False, True])
+            for name, array in (
+                ("observations", np.zeros((3, 1), dtype=np.float32)),
+                ("actions", np.zeros((2, 1), dtype=np.float32)),
+                ("rewards", np.zeros(2, dtype=np.float32)),
+                ("terminated", ended),
+                ("truncated", ~ended if attributes.get("early") else ended),
+            ):
+                group[name] = array
+        return path
+
+    return make
+
+
+def endless_heap(entry: bytes) -> Make:
+    """Our own layout with a text whose heap the library would walk for ever, or beyond its end."""
+
+    def make(places: Places) -> Path:
+        path = ours()(places)
+        content = bytearray(path.read_bytes())
+        first = content.index(b"GCOL") + 16
+        content[first : first + len(entry)] = entry
+        path.write_bytes(content)
+        return path
+
+    return make
+
+
+def shortened(share: float) -> Make:
+    def make(places: Places) -> Path:
+        path = hdf5(lambda file, _: None, without="")(places)
+        path.write_bytes(path.read_bytes()[: int(share * path.stat().st_size)])
+        return path
+
+    return make
+
+
+def not_hdf5(places: Places) -> Path:
+    places.folder.mkdir()
+    (places.folder / "no.hdf5").write_bytes(os.urandom(10_000))
+    return places.folder / "no.hdf5"
+
+
+def pipe_file(places: Places) -> Path:
+    places.folder.mkdir()
+    os.mkfifo(places.folder / "pipe.hdf5")
+    return places.folder / "pipe.hdf5"
+
+
+def replaced(value: Any, **options: Any) -> Make:
+    return hdf5(lambda file, _: file.create_dataset("observations", data=value, **options))
+
+
+def shaped(shape: tuple[int, ...], **options: Any) -> Make:
+    return hdf5(lambda file, _: file.create_dataset("observations", shape, np.float32, **options))
+
+
+HDF5: dict[str, Make] = {
+    "hdf5: an external link": hdf5(
+        lambda file, places: file.__setitem__(
+            "observations", h5py.ExternalLink(secret_file(places), "/observations")
+        )
+    ),
+    "hdf5: an external link to a pipe": hdf5(
+        lambda file, places: (
+            os.mkfifo(places.secret),
+            file.__setitem__("observations", h5py.ExternalLink(str(places.secret), "/a")),
+        )
+    ),
+    "hdf5: a soft link": hdf5(
+        lambda file, _: file.__setitem__("observations", h5py.SoftLink("/next_observations"))
+    ),
+    "hdf5: a soft link to itself": hdf5(
+        lambda file, _: file.__setitem__("observations", h5py.SoftLink("/observations"))
+    ),
+    "hdf5: a dangling link": hdf5(
+        lambda file, _: file.__setitem__("observations", h5py.SoftLink("/nowhere"))
+    ),
+    "hdf5: a virtual dataset": hdf5(virtual),
+    "hdf5: values in another file": hdf5(external),
+    "hdf5: another filter": replaced(FLAT["observations"], compression="lzf"),
+    "hdf5: a chunk that is a bomb": hdf5(overfull_chunk),
+    "hdf5: zeros that are a bomb": replaced(np.zeros((2**24, 2), dtype=np.float32), compression="gzip"),
+    "hdf5: 8 TiB that are not there": shaped((TEBI // 8, 2)),
+    "hdf5: 8 TiB of no chunks": shaped((TEBI // 8, 2), chunks=(64, 2)),
+    "hdf5: one chunk of 2 GiB": shaped((64, 2), chunks=(2**28, 2), maxshape=(None, 2)),
+    "hdf5: texts": replaced(np.array([b"a"] * 64, dtype="S1")),
+    "hdf5: texts of any length": replaced(np.array(["a"] * 64, dtype=object), dtype=h5py.string_dtype()),
+    "hdf5: tables": replaced(np.zeros(64, dtype=[("a", "f4")])),
+    "hdf5: references": hdf5(lambda file, _: file.create_dataset("observations", (64,), h5py.ref_dtype)),
+    "hdf5: complex numbers": replaced(np.zeros((64, 2), dtype=np.complex64)),
+    "hdf5: no shape": hdf5(lambda file, _: file.__setitem__("observations", h5py.Empty("f4"))),
+    "hdf5: a group": hdf5(lambda file, _: file.create_group("observations")),
+    "hdf5: a group in itself": hdf5(lambda file, _: file.__setitem__("observations", file["/"])),
+    "hdf5: a type": hdf5(lambda file, _: file.__setitem__("observations", np.dtype("f4"))),
+    "hdf5: one episode 2,000 times": looped,
+    "hdf5: a task of another world": ours(task=2**40),
+    "hdf5: a negative step": ours(step=-1),
+    "hdf5: a text for a step": ours(step="x"),
+    "hdf5: parameters in brackets": ours(parameters="[" * 60_000),
+    "hdf5: parameters that write to a terminal": ours(parameters=json.dumps({"a": "\x1b]0;owned\x07"})),
+    "hdf5: an early flag": ours(early=True),
+    "hdf5: an attribute of many": ours(format_version=np.ones(1000)),
+    "hdf5: a heap without end": endless_heap(bytes(16)),
+    "hdf5: a heap with an entry of 8 TiB": endless_heap(struct.pack("<HHIQ", 1, 1, 0, TEBI)),
+    "hdf5: a heap with an entry that wraps": endless_heap(struct.pack("<HHIQ", 1, 1, 0, 2**64 - 16)),
+    "hdf5: no HDF5": not_hdf5,
+    "hdf5: a pipe": pipe_file,
+} | {f"hdf5: cut at {share}": shortened(share) for share in (0.01, 0.3, 0.6, 0.99)}

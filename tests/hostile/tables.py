@@ -1,0 +1,219 @@
+"""Forged tables of tasks and parts, and parts at places where they do not belong."""
+
+import json
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from tcmrl_data.store.part_table import HEADER, PARTS_TABLE
+from tcmrl_data.store.task_table import TASKS
+from tests.hostile.case import (
+    ESCAPE,
+    Case,
+    Damage,
+    Stage,
+    device,
+    in_file,
+    linked,
+    socket_file,
+    special_file,
+    two_names,
+    with_field,
+    with_name,
+    with_recipe,
+    with_run,
+)
+from tests.hostile.datasets import PART, Forge
+
+
+def _tasks(name: str, damage: Damage, words: str, stage: Stage = "tables") -> Case:
+    return Case(f"tasks: {name}", damage, TASKS, (words,), stage)
+
+
+def _parts(name: str, damage: Damage, words: str, stage: Stage = "tables") -> Case:
+    return Case(f"parts: {name}", damage, PARTS_TABLE, (words,), stage)
+
+
+def _raw(table: str, change: Callable[[bytes], bytes]) -> Damage:
+    """Other bytes in a table, which the manifest still seals as they were."""
+
+    def damage(forge: Forge) -> None:
+        file = forge.folder / table
+        file.write_bytes(change(file.read_bytes()))
+
+    return damage
+
+
+def _sealed(table: str, change: Callable[[bytes], bytes], **lies: int) -> Damage:
+    """Other bytes in a table, which the manifest seals."""
+    return lambda forge: forge.table(table, change((forge.folder / table).read_bytes()), **lies)
+
+
+def _task(**fields: Any) -> Damage:
+    return lambda forge: forge.rows(TASKS, lambda rows: rows[0].update(fields))
+
+
+def _parameters(**fields: Any) -> Damage:
+    return lambda forge: forge.rows(TASKS, lambda rows: rows[0]["parameters"].update(fields))
+
+
+def _cell(column: str, value: Any, row: int = 0) -> Damage:
+    return lambda forge: forge.cell(row, column, value)
+
+
+TASK_TABLES = [
+    _tasks("missing", lambda f: (f.folder / TASKS).unlink(), "missing"),
+    _tasks("linked", linked(TASKS), "a link"),
+    _tasks("linked to a device", special_file(TASKS, device), "a link"),
+    _tasks("of two names", two_names(TASKS), "hard links"),
+    _tasks("a FIFO", special_file(TASKS, os.mkfifo), "a FIFO"),
+    _tasks("a socket", special_file(TASKS, socket_file), "a socket"),
+    _tasks("a folder", special_file(TASKS, Path.mkdir), "a folder"),
+    _tasks("truncated", _raw(TASKS, lambda data: data[:-1]), "manifest seals"),
+    _tasks("empty", _raw(TASKS, lambda data: b""), "manifest seals"),
+    _tasks("longer", _raw(TASKS, lambda data: data + data), "does not seal", "verify"),
+    _tasks("no newline at the end", _sealed(TASKS, lambda data: data[:-1]), ""),
+    _tasks("lines lie", _sealed(TASKS, lambda data: data, lines=3), "manifest seals"),
+    _tasks("bytes lie", _sealed(TASKS, lambda data: data, bytes=2**30), "manifest seals"),
+    _tasks("two lines in one", _sealed(TASKS, lambda data: data.replace(b"\n", b",", 1)), ""),
+    _tasks("duplicate key", _sealed(TASKS, lambda data: data.replace(b"{", b'{"index":0,', 1)), "canonical"),
+    _tasks("spaces", _sealed(TASKS, lambda data: data.replace(b":", b": ", 1)), "canonical"),
+    _tasks("no UTF-8", _sealed(TASKS, lambda data: data.replace(b"goal", b"\xff", 1)), ""),
+    _tasks("NaN", _sealed(TASKS, lambda data: data.replace(b"1.0", b"NaN", 1)), ""),
+    _tasks("1e999", _sealed(TASKS, lambda data: data.replace(b"1.0", b"1e999", 1)), ""),
+    _tasks("5000 digits", _sealed(TASKS, lambda data: data.replace(b"1.0", b"9" * 5000, 1)), ""),
+    _tasks("surrogate", _sealed(TASKS, lambda data: data.replace(b"goal", b"\\ud800", 1)), ""),
+    _tasks("deep", _sealed(TASKS, lambda data: data.replace(b"1.0", b"[" * 10**5, 1)), ""),
+    _tasks(
+        "deep and closed",
+        _parameters(goal=json.loads("[" * 150 + "]" * 150)),
+        "parameters of task 0",
+        "verify",
+    ),
+    _tasks("a huge line", _sealed(TASKS, lambda data: b"x" * 2**22 + b"\n"), "bytes"),
+    _tasks("a long line", _parameters(goal="a" * 2**17), "bytes"),
+    _tasks("a million commas", _sealed(TASKS, lambda data: b"," * 10**6 + b"\n"), ""),
+    _tasks("200,000 lists", _sealed(TASKS, lambda data: b"[" + b"[]," * 200_000 + b"[]]\n"), ""),
+    _tasks("40,000 bad lines", _sealed(TASKS, lambda data: b"{}\n" * 40_000), "index"),
+    _tasks("40,000 lists", _sealed(TASKS, lambda data: b"[]\n" * 40_000), ""),
+    _tasks("index -1", _task(index=-1), "index"),
+    _tasks("index 2**70", _task(index=2**70), "index"),
+    _tasks("index as path", _task(index="../7"), "index"),
+    _tasks("index as float", _task(index=0.0), "index"),
+    _tasks("index as flag", _task(index=True), "index"),
+    _tasks("split unknown", _task(split="both"), "split"),
+    _tasks("unknown key", _task(surprise=1), "surprise"),
+    _tasks("parameters a list", _task(parameters=[]), "parameters"),
+    _tasks("a task twice", lambda f: f.rows(TASKS, lambda rows: rows.append(rows[0])), "twice"),
+    _tasks("parameter escapes", _parameters(**{"\x9b2J": 1}), "control characters"),
+    _tasks("parameter escapes as text", _parameters(goal=ESCAPE), "goal holds control"),
+    _tasks("parameter turns text", _parameters(goal="\u202ekcatta"), "goal holds control"),
+    _tasks("parameter deletes", _parameters(goal="\x7f"), "goal holds control"),
+    _tasks("parameters edited", _parameters(goal=[0.0, 2.0]), "parameters of task 0", "verify"),
+    _tasks("split edited", _task(split="test"), "split of task 0", "verify"),
+    _tasks(
+        "trillion tasks",
+        with_recipe(lambda v: v["environment"].update(tasks=10**12)),
+        "environment.tasks",
+        "verify",
+    ),
+    _tasks("environment unknown", with_name("no-such-environment"), "no-such-environment", "verify"),
+    _tasks(
+        "unknown setting",
+        with_recipe(lambda v: v["environment"].update(plugin="evil.py")),
+        "recipe.environment",
+        "verify",
+    ),
+]
+
+PART_TABLES = [
+    _parts("missing", lambda f: (f.folder / PARTS_TABLE).unlink(), "missing"),
+    _parts("linked", linked(PARTS_TABLE), "a link"),
+    _parts("linked to a device", special_file(PARTS_TABLE, device), "a link"),
+    _parts("of two names", two_names(PARTS_TABLE), "hard links"),
+    _parts("a FIFO", special_file(PARTS_TABLE, os.mkfifo), "a FIFO"),
+    _parts("a socket", special_file(PARTS_TABLE, socket_file), "a socket"),
+    _parts("a folder", special_file(PARTS_TABLE, Path.mkdir), "a folder"),
+    _parts("truncated", _raw(PARTS_TABLE, lambda data: data[:-1]), "manifest seals"),
+    _parts("empty", _raw(PARTS_TABLE, lambda data: b""), "manifest seals"),
+    _parts("an empty one sealed", _sealed(PARTS_TABLE, lambda data: b""), "columns"),
+    _parts("longer", _raw(PARTS_TABLE, lambda data: data + data), "does not seal", "verify"),
+    _parts("lines lie", _sealed(PARTS_TABLE, lambda data: data, lines=99), "manifest seals"),
+    _parts("bytes lie", _sealed(PARTS_TABLE, lambda data: data, bytes=2**10), "manifest seals"),
+    _parts("no header", _sealed(PARTS_TABLE, lambda data: data[len(HEADER) :]), "columns"),
+    _parts("another header", _sealed(PARTS_TABLE, lambda data: data.replace(b"step", b"stop", 1)), "columns"),
+    _parts("a header twice", _sealed(PARTS_TABLE, lambda data: HEADER + data), ""),
+    _parts(
+        "two parts in a line", _sealed(PARTS_TABLE, lambda data: b"]\n,[".join(data.rsplit(b"]\n[", 1))), ""
+    ),
+    _parts(
+        "one line of two parts",
+        _sealed(PARTS_TABLE, lambda data: b"],[".join(data.rsplit(b"]\n[", 1))),
+        "line",
+    ),
+    _parts("an object", _sealed(PARTS_TABLE, lambda data: data + b'{"task":0}\n'), ""),
+    _parts("NaN", _sealed(PARTS_TABLE, lambda data: data.replace(b"null", b"NaN", 1)), ""),
+    _parts("1e999", _sealed(PARTS_TABLE, lambda data: data.replace(b"null", b"1e999", 1)), ""),
+    _parts("no UTF-8", _sealed(PARTS_TABLE, lambda data: data.replace(b'"main"', b'"\xff"', 1)), ""),
+    _parts("deep", _sealed(PARTS_TABLE, lambda data: data + b"[" * 10**5 + b"\n"), ""),
+    _parts("a huge line", _sealed(PARTS_TABLE, lambda data: data + b"x" * 2**22 + b"\n"), "bytes"),
+    _parts("a million commas", _sealed(PARTS_TABLE, lambda data: data + b"," * 10**6 + b"\n"), ""),
+    _parts("300,000 lists", _sealed(PARTS_TABLE, lambda data: data + b"[" + b"[]," * 300_000 + b"[]]\n"), ""),
+    _parts("40,000 bad lines", _sealed(PARTS_TABLE, lambda data: data + b"[]\n" * 40_000), ""),
+    _parts("40,000 objects", _sealed(PARTS_TABLE, lambda data: data + b"{}\n" * 40_000), ""),
+    _parts("a part twice", lambda f: f.rows(PARTS_TABLE, lambda rows: rows.append(rows[1])), "twice"),
+    _parts("a value too few", lambda f: f.rows(PARTS_TABLE, lambda rows: rows[1].pop()), ""),
+    _parts("a value too many", lambda f: f.rows(PARTS_TABLE, lambda rows: rows[1].append(0)), ""),
+    _parts("task -1", _cell("task", -1), "0.0"),
+    _parts("task 2**70", _cell("task", 2**70), "0.0"),
+    _parts("task as path", _cell("task", "../7"), "0.0"),
+    _parts("task as float", _cell("task", 0.0), "0.0"),
+    _parts("step of 4000 digits", _cell("step", 10**3999), "0.1"),
+    _parts("step as flag", _cell("step", True), "0.1"),
+    _parts("run climbs", _cell("run", "../../../etc"), "0.2"),
+    _parts("run newline", _cell("run", "main\n"), "0.2"),
+    _parts("run NUL", _cell("run", "main\0"), "0.2"),
+    _parts("run escapes", _cell("run", ESCAPE), "0.2"),
+    _parts("run of 5000", _cell("run", "a" * 5000), "0.2"),
+    _parts("run that is none", _cell("run", "other"), "run"),
+    _parts("id newline", _cell("id", "a" * 64 + "\n"), "0.3"),
+    _parts("id climbs", _cell("id", "../" * 20), "0.3"),
+    _parts("sha256 in capitals", _cell("sha256", "A" * 64), "0.4"),
+    _parts("size below zero", _cell("size", -1), "0.5"),
+    _parts("size 2**62", _cell("size", 2**62), "0.5"),
+    _parts("platform -1", _cell("platform", -1), "0.6"),
+    _parts("platform 10**6", _cell("platform", 10**6), "0.6"),
+    _parts("platform that is none", _cell("platform", 1), "platform", "verify"),
+    _parts("mean as text", _cell("mean", "high"), "0.9"),
+    _parts("oracle as text", _cell("oracle", "high"), "0.15"),
+    _parts("part of no task", lambda f: f.rows(TASKS, lambda rows: rows.pop()), "names a task", "verify"),
+    _parts("of no task at all", _sealed(TASKS, lambda data: b""), "names a task", "verify"),
+]
+
+PLACES = [
+    in_file("another id", _cell("id", "0" * 64), PART, "manifest", "read"),
+    in_file("another sha256", _cell("sha256", "0" * 64), PART, "sha256"),
+    in_file("another size", _cell("size", 1), PART, "instead of 1", "read"),
+    in_file("oracle edited", _cell("oracle", 1e9), PART, "references.oracle"),
+    in_file("mean edited in the table", _cell("mean", 1e9), PART, "statistics.mean"),
+    in_file("success of nothing", _cell("success_rate", 1.0), PART, "statistics.success_rate"),
+    in_file(
+        "another task in the table", _cell("task", 99, row=1), "parts/main/00099", "cannot be read", "read"
+    ),
+    in_file("another step", _cell("step", 7), "0000007.zip", "is missing", "read"),
+    in_file(
+        "billion lanes",
+        with_recipe(lambda v: v["rollouts"].update(lanes=10**9, episodes=10**9)),
+        PART,
+        "identity.settings",
+    ),
+    in_file("seed edited", with_run(seed=9), PART, "identity.seed"),
+    in_file("data version edited", with_field(data_version=1), PART, "identity.data_version"),
+    in_file(
+        "platform edited",
+        lambda f: f.manifest(lambda v: v["platforms"][0].update(cpu="another")),
+        PART,
+        "another platform",
+    ),
+]
