@@ -1,7 +1,6 @@
-"""Training: configuration, determinism, resuming, checkpoints, metrics, and `tcmrl train`."""
+"""Training: determinism, resuming, checkpoints, metrics, and `tcmrl train`."""
 
 import json
-import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,40 +9,18 @@ from typing import Any
 
 import pytest
 import torch
-from pydantic import BaseModel
 from tcmrl_cli.train import tcmrl
 
 import tcmrl_algo
-from tcmrl_algo import TrainingConfig, open_run, resolve, resume_run, train_run
-from tcmrl_algo.algorithms import tcmrl as tcmrl_module
+from tcmrl_algo import open_run, resume_run, train_run
 from tcmrl_algo.methods.base import METHODS
-from tcmrl_algo.settings.actor_critic import ActorCriticSettings
-from tcmrl_algo.settings.batch import BatchSettings
-from tcmrl_algo.settings.brac import BracSettings
-from tcmrl_algo.settings.optimizer import OptimizerSettings
-from tcmrl_algo.settings.run import RunSettings
-from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_algo.training.train import TrainingProgress
-from tcmrl_data import CheckpointError, Dataset, SelectionError, TcmrlError, TrainingError
+from tcmrl_data import CheckpointError, Dataset, SelectionError, TrainingError
 from tests.commands import Call, assert_refused, in_process
 from tests.datasets import with_tasks
+from tests.small_training import SMALL, config_of
 
-SMALL = (
-    "run.log_every=10",
-    "run.checkpoint_every=25",
-    "batch.transitions=8",
-    "actor_critic.hidden=[8]",
-    "tcmrl.latent=4",
-    "tcmrl.encoder_hidden=[8]",
-    "tcmrl.tce_hidden=[8]",
-    "tcmrl.estimator_hidden=[8]",
-)
 Train = Callable[..., tcmrl_algo.TrainingReport]
-
-
-def config_of(dataset: Dataset, *overrides: str, algorithm: str | None = None) -> TrainingConfig:
-    table = dataset.manifest.training["quick"]
-    return resolve(table, place="quick", algorithm=algorithm, overrides=(*SMALL, *overrides))
 
 
 @pytest.fixture
@@ -60,56 +37,6 @@ def start(tiny: Dataset, tmp_path: Path) -> Train:
 @pytest.fixture
 def call(capsys: pytest.CaptureFixture[str]) -> Call:
     return in_process(tcmrl, capsys)
-
-
-def test_recipe_values_reach_the_run(tiny: Dataset) -> None:
-    settings = resolve(tiny.manifest.training["quick"], place="quick").settings
-    assert settings.actor_critic.gamma == 0.9
-    assert settings.batch.context_trajectories == (1, 2, 4)
-    paper = resolve(tiny.manifest.training["paper"], place="paper").settings
-    assert paper.run.steps == 100_000
-    assert paper.actor_critic.hidden == (256, 256, 256)
-
-
-def test_an_empty_table_resolves_to_sourced_defaults() -> None:
-    config = resolve({}, place="nothing")
-    assert config.settings == TrainingSettings()
-    assert config.method["latent"] == 20
-    assert TrainingConfig.model_validate_json(config.model_dump_json()) == config
-
-
-def test_overrides_come_last_and_keep_their_types(tiny: Dataset) -> None:
-    config = config_of(
-        tiny, "tcmrl.weights.negative=0", "actor_critic.brac.mode=policy", "batch.context_trajectories=[2]"
-    )
-    assert config.method["weights"]["negative"] == 0.0
-    assert config.method["weights"]["positive"] == 1.0
-    assert config.settings.actor_critic.brac.mode == "policy"
-    assert config.settings.batch.context_trajectories == (2,)
-
-
-@pytest.mark.parametrize(
-    ("override", "expected"),
-    [
-        ("tcmrl.latent=many", "latent"),
-        ("tcmrl.latent=2.5", "latent"),
-        ("tcmrl.latnet=3", "latnet"),
-        ("run.steps=true", "steps"),
-        ("actor_critic.gamma=1.5", "gamma"),
-        ("actor_critc.gamma=0.5", "actor_critc"),
-        ("batch.tasks=1", "tasks"),
-        ("nonsense", "nonsense"),
-    ],
-)
-def test_bad_overrides_are_named(tiny: Dataset, override: str, expected: str) -> None:
-    with pytest.raises(TcmrlError, match=expected) as caught:
-        config_of(tiny, override)
-    assert len(str(caught.value).splitlines()) == 1
-
-
-def test_unknown_algorithm_names_the_nearest(tiny: Dataset) -> None:
-    with pytest.raises(TcmrlError, match=r"tcmlr.*tcmrl"):
-        config_of(tiny, algorithm="tcmlr")
 
 
 @pytest.mark.parametrize("algorithm", METHODS.names())
@@ -395,21 +322,3 @@ def test_public_names_load() -> None:
     assert set(dir(tcmrl_algo)) == set(tcmrl_algo.__all__)
     with pytest.raises(AttributeError):
         tcmrl_algo.nothing  # noqa: B018
-
-
-@pytest.mark.parametrize(
-    "table",
-    [
-        RunSettings,
-        OptimizerSettings,
-        BatchSettings,
-        ActorCriticSettings,
-        BracSettings,
-        tcmrl_module.TcmrlConfig,
-        tcmrl_module.Weights,
-    ],
-    ids=lambda table: table.__name__,
-)
-def test_every_setting_is_documented(table: type[BaseModel]) -> None:
-    documented = re.findall(r"^\s+([\w, ]+): ", table.__doc__ or "", re.MULTILINE)
-    assert set(table.model_fields) <= {name for line in documented for name in line.split(", ")}
