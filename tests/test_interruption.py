@@ -15,7 +15,7 @@ from tcmrl_algo import open_run, resume_run, train_run
 from tcmrl_algo.training.train import TrainingProgress
 from tcmrl_data import Dataset
 from tests.commands import Call, assert_refused, in_process
-from tests.test_train import SMALL, config_of
+from tests.small_training import SMALL, config_of
 from tests.workers import PATIENCE, command_line, wait_for
 
 SETTINGS = [argument for text in SMALL for argument in ("--set", text)]
