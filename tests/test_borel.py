@@ -18,7 +18,15 @@ from tcmrl_algo.losses.beliefs import belief_divergence, belief_reconstruction
 from tcmrl_algo.methods.padding import pad_trajectories
 from tcmrl_algo.methods.stages import StagePlan
 from tcmrl_algo.networks.recurrent import recurrent
-from tcmrl_data import Batch, Dataset, TrainingError, Trajectories, Trajectory, Transition
+from tcmrl_data import (
+    Batch,
+    Dataset,
+    TrainingError,
+    Trajectories,
+    Trajectory,
+    Transition,
+    UniformController,
+)
 from tests.context_learners import gradients, losses_of
 from tests.made_up import batch_for, problem, settings, steps, trajectory
 
@@ -253,10 +261,11 @@ def test_dense_rewards_are_refused() -> None:
         Borel().create(problem(stages=stages), shared, config)
 
 
-def test_it_collects_by_the_policy_under_the_belief() -> None:
+def test_it_collects_by_the_policy_under_the_belief_or_by_uniform_actions() -> None:
     made, lanes = algorithm(), [[trajectory(6, 0)], []]
     found = made.explore(lanes).act(STATES, NOISE)
     np.testing.assert_array_equal(found, made.adapt(lanes).act(STATES, NOISE))
+    assert isinstance(algorithm(explore="uniform").explore(lanes), UniformController)
 
 
 @pytest.mark.sweep

@@ -201,6 +201,18 @@ def test_evaluate_command_prints_the_documented_json(trained: Path, call: Call) 
     assert task["success"] is None
 
 
+def test_a_changed_random_stage_reaches_methods_that_explore(
+    trained: Path, tiny: Dataset, tmp_path: Path
+) -> None:
+    """A CSRO whose first stage is uniform makes the episodes of a method that does not explore."""
+    overrides = (*SMALL, "run.random_episodes=1", "csro.random_share=1")
+    config = resolve(tiny.manifest.training["quick"], place="quick", algorithm="csro", overrides=overrides)
+    train_run(tiny, tmp_path / "csro", config=config, profile="quick", steps=2)
+    changed = {"protocol": "paper", "episodes": 4, "random_episodes": 3, "repeats": 1}
+    found, expected = (evaluate_run(folder, **changed) for folder in (tmp_path / "csro", trained))
+    assert found.adaptation_curve[:3] == pytest.approx(expected.adaptation_curve[:3])
+
+
 def test_evaluate_command_changes_the_random_stage(trained: Path, call: Call) -> None:
     options = ("--protocol", "paper", "--random-episodes", 1, "--repeats", 2, "--json", "--quiet")
     code, output, _ = call("evaluate", trained, *options)

@@ -221,14 +221,14 @@ def test_a_lane_without_trajectories_keeps_the_start() -> None:
         assert not torch.allclose(weights[1], start)
 
 
-def test_it_collects_by_the_policy_of_the_start_with_noise() -> None:
-    made = learner()
+def test_it_collects_by_uniform_actions_or_the_policy_of_the_start_with_noise() -> None:
+    made = learner(explore="policy")
     start = made.adapt([[], []]).act(STATES, NOISE)
     lanes = [[trajectory(6, 0)], [trajectory(6, 1)]]
     found = made.explore(lanes).act(STATES, NOISE)
     np.testing.assert_allclose(found, np.clip(start + 0.2, -1, 1), rtol=1e-5)
     assert made.explore(lanes).act(STATES, 100 * NOISE).max() <= 1
-    assert isinstance(learner(explore="uniform").explore(lanes), UniformController)
+    assert isinstance(learner().explore(lanes), UniformController)
 
 
 @pytest.mark.sweep

@@ -107,10 +107,12 @@ def evaluate_open_run(
         raise TrainingError(
             f"{dataset.folder} contains no test task; build one with `tcmrl-data build --tasks`"
         )
-    on_cpu = run.record.model_copy(update={"device": "cpu"})  # this machine may lack the run's device
-    algorithm = create_algorithm(on_cpu, dataset)
+    config = run.record.config
+    config = config.model_copy(update={"settings": config.settings.model_copy(update={"run": settings})})
+    # This machine may lack the run's device, and how a method explores may depend on the settings here.
+    algorithm = create_algorithm(run.record.model_copy(update={"device": "cpu", "config": config}), dataset)
     algorithm.load_tensors(run.newest().tensors())
-    method, _ = method_of(run.record.config)
+    method, _ = method_of(config)
     seed = run.record.seed
     controls = dataset_controls(dataset, report=report)
     arena = Arena(dataset, algorithm, settings, capabilities=method.capabilities, seed=seed, report=report)

@@ -7,8 +7,11 @@ The actor-critic is ours; with the recipe's behavior regularisation it is "Batch
 Every episode has a z of its own: drawn from the prior while nothing is known, from the posterior afterwards.
 
 Our inference: the draw of an episode depends on the run's seed and on the number of trajectories alone, so
-that adaptation is deterministic and a task's context does not depend on its neighbours. As in the published
-code, how much the divergence weighs depends on the scale of the rewards.
+that adaptation is deterministic and a task's context does not depend on its neighbours.
+
+As in the published code, how much the divergence weighs depends on the scale of the rewards: the critics'
+losses grow with its square. Where a profile divides `actor_critic.reward_scale` by n, its `kl_weight` is
+divided by n squared; otherwise the posterior collapses to the prior, whatever the data.
 """
 
 from collections.abc import Sequence
@@ -115,7 +118,7 @@ class Pearl(Method[PearlConfig]):
     name = "pearl"
     Config = PearlConfig
     capabilities = Capabilities(explores=True, needs_trajectories=False)
-    search: ClassVar[Search] = {**SHARED_SEARCH, "pearl.kl_weight": Factors(0.1, 10.0)}
+    search: ClassVar[Search] = {**SHARED_SEARCH, "pearl.kl_weight": Factors(0.01, 100.0)}
 
     def batch_request(self, settings: TrainingSettings, config: PearlConfig) -> BatchRequest:
         """Transitions for the actor-critic, and trajectories of the same task for the posterior."""

@@ -53,7 +53,16 @@ from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
 from tcmrl_algo.methods.stages import Stage
 from tcmrl_algo.settings.training import TrainingSettings
-from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectories, Trajectory, Transition
+from tcmrl_data import (
+    Batch,
+    BatchRequest,
+    Controller,
+    Steps,
+    Trajectories,
+    Trajectory,
+    Transition,
+    UniformController,
+)
 
 BELIEF_STAGE, POLICY_STAGE = "belief", "policy"
 
@@ -146,6 +155,8 @@ class BorelLearner(ContextLearner):
 
     def explore(self, actor_critic: ActorCritic, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         """The policy, whose belief starts from the prior: it was trained to act under any belief."""
+        if self._config.explore == "uniform":
+            return UniformController()
         with torch.no_grad():
             return self.controller(actor_critic, pad_trajectories(trajectories, self._problem))
 

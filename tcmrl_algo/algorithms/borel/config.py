@@ -24,6 +24,8 @@ class BorelConfig(MethodConfig):
         reconstruction: whether a prediction's errors are a `mean` over steps (published code) or their `sum`
             (paper), which makes the divergences weigh less.
         episodes_per_belief: episodes of a task that are filtered one after the other (published code: 2).
+        explore: who collects before there are data: the `policy` under a belief that starts from the prior
+            (published code), or `uniform` actions (ours).
         vae_share: share of all steps that train the belief; the others train the policy (ours).
     """
 
@@ -38,4 +40,5 @@ class BorelConfig(MethodConfig):
     elbo_terms: int = Field(default=8, ge=1)
     reconstruction: Literal["mean", "sum"] = "mean"
     episodes_per_belief: int = Field(default=2, ge=2)
+    explore: Literal["policy", "uniform"] = "policy"
     vae_share: float = Field(default=0.25, gt=0, lt=1)

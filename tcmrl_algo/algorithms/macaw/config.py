@@ -25,7 +25,7 @@ class MacawConfig(MethodConfig):
         target_step: share of the adapted value network in the one of the outer targets (published code: 0.1).
         inner_rows: most steps of a context that an inner step reads (published code: 256).
         first_order: leaves out the derivative of inner gradients (ours, for speed).
-        explore: who collects before there are data: the unadapted `policy`, or `uniform` actions.
+        explore: who collects before there are data: `uniform` actions, or the unadapted `policy`.
     """
 
     hidden: tuple[int, ...] = Field(default=(100, 100, 100), min_length=1)
@@ -42,4 +42,4 @@ class MacawConfig(MethodConfig):
     target_step: float = Field(default=0.1, ge=0, le=1)
     inner_rows: int = Field(default=256, ge=2)
     first_order: bool = False
-    explore: Literal["policy", "uniform"] = "policy"
+    explore: Literal["policy", "uniform"] = "uniform"

@@ -27,8 +27,8 @@ Our inferences and choices:
 - Nothing is bootstrapped where the task ended an episode.
 - Returns are divided by the largest that rewards allow in an episode, so that V, its learning rate and the
   inner rates mean the same everywhere.
-- Exploration is the policy of the start with noise of its own sigma: uniform actions are all poor, so that
-  weights by advantage mean little there.
+- Exploration is uniform, as the protocols have it. No loss trains the policy of the start to act well, and
+  training contexts hold episodes of untrained policies, but none like those that it collects.
 - With dense rewards for the outer losses (`actor_critic.rewards`), inner steps see the stored rewards, as a
   test task shows them.
 
