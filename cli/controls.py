@@ -61,8 +61,11 @@ def _fitted(found: "Controls") -> list[str]:
     notes = []
     if found.fixed_snapshot is not None:
         policy = found.fixed_snapshot
-        mean = number(policy.train_return)
-        notes.append(f"fixed snapshot: task {policy.task}, step {policy.step:,} ({mean} in training tasks)")
+        mean, average = number(policy.train_return), number(policy.average_return)
+        notes.append(
+            f"fixed snapshot: task {policy.task}, step {policy.step:,} ({mean} in training tasks; "
+            f"{average} on average over the tasks' last policies)"
+        )
     if found.fixed_target is not None:
         notes.append(f"fixed target: {number(found.fixed_target.train_return)} in training tasks")
     return notes

@@ -70,6 +70,7 @@ def test_the_fixed_snapshot_is_the_training_tasks_last_policy_that_does_best_the
     assert (found.fixed_snapshot.task, found.fixed_snapshot.step) == (best, 150)
     assert found.fixed_snapshot.train_returns == pytest.approx(means, abs=1e-4)
     assert found.fixed_snapshot.train_return == pytest.approx(means[best], abs=1e-4)
+    assert found.fixed_snapshot.average_return == pytest.approx(fmean(means.values()), abs=1e-4)
     (task,) = found.tasks
     expected = walk(tiny, tiny.test_tasks[0], silent(tiny, best, 150))
     assert task.fixed_snapshot == pytest.approx(expected, abs=1e-4)

@@ -94,13 +94,19 @@ class ControlBench:
             return None, None
         screening = [training[place] for place in chosen]
         means = {key: fmean(self.returns(screening, control, 1)) for key, control in found.items()}
+        average = fmean(means.values())
         if len(training) > SCREENING_TASKS:
             finalists = sorted(means, key=means.__getitem__)[-FINALISTS:]
             means = {key: fmean(self.returns(training, found[key], 1)) for key in finalists}
         best = max(means, key=means.__getitem__)
         returns = {key.task: means[key] for key in sorted(means, key=means.__getitem__)}
         record = FixedSnapshot(
-            task=best.task, step=best.step, run=best.run, train_return=means[best], train_returns=returns
+            task=best.task,
+            step=best.step,
+            run=best.run,
+            train_return=means[best],
+            train_returns=returns,
+            average_return=average,
         )
         return record, found[best]
 

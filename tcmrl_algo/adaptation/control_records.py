@@ -17,6 +17,8 @@ class FixedSnapshot(_Record):
         task, step, run: the part that holds the policy.
         train_return: mean over the training tasks.
         train_returns: mean of every candidate that was tried in all of them, by the candidate's task.
+        average_return: mean over all candidates, in the training tasks in which all were tried: what the
+            choice of the best is worth, for which candidates act in the tasks.
     """
 
     task: int
@@ -24,6 +26,7 @@ class FixedSnapshot(_Record):
     run: str
     train_return: float
     train_returns: dict[int, float]
+    average_return: float
 
 
 class FixedTarget(_Record):
@@ -77,7 +80,7 @@ class Controls(_Record):
         tasks: the test tasks.
     """
 
-    schema_version: Literal[1] = 1
+    schema_version: Literal[2] = 2
     environment: str
     dataset_root: str
     splits: dict[int, str]
