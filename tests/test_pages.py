@@ -54,9 +54,11 @@ def test_a_marked_number_is_recomputed_with_its_decimals(
 
 def test_a_marked_table_is_that_of_the_report(pages: Pages) -> None:
     text = "a\n<!-- returns small -->\nold\n<!-- end -->\nb\n<!-- claims small -->\n<!-- end -->\n"
+    text += "<!-- boards small -->\n<!-- end -->\n"
     rewritten = pages.rewritten(text)
     assert "old" not in rewritten and rewritten.startswith("a\n") and "\nb\n" in rewritten
     assert "| offline | TCMRL | 5 | 3 |" in rewritten and "TCMRL ends higher" in rewritten
+    assert "| TCMRL | 5 | 1 | 3 (" in rewritten
     assert pages.rewritten(rewritten) == rewritten
 
 

@@ -106,7 +106,7 @@ def leaderboard(sources: Sequence[Source], out: Path) -> Page:
             page.text(
                 f"There are results on {others} more datasets or splits of {board.environment}, ranked apart."
             )
-        page.text(_returns(board).markdown())
+        page.text(returns_table(board).markdown())
         scores = _scores(board)
         if scores is not None:
             page.text(SCORES)
@@ -176,7 +176,7 @@ def _row(
     return (*found, regret, other, success, share, *_effort_of(entry, pace), coverage(runs))
 
 
-def _returns(board: Board) -> Table:
+def returns_table(board: Board) -> Table:
     """Returns with intervals, a column per protocol, the best mean rank first."""
     ranks = {protocol: board.ranks(protocol) for protocol in board.protocols}
     rows: list[tuple[Cell, ...]] = []

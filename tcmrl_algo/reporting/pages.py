@@ -9,12 +9,13 @@ is one number, with as many decimals as stand there, and
     <!-- returns figure4_point_robot -->
     <!-- end -->
 
-is a whole table; `<!-- worth FOLDER -->` is that of the documents of `inspect worth --json` in a folder
-beside all reports. Folders are those of reports below one root, such as `docs/results`. The keys of a
-number are folder, environment, protocol, method and a quantity (`final`, `shuffled`, `regret`,
-`normalized`, `fixed`, and `low` or `high`, the ends of the 95% interval of `final`); or folder,
-environment, protocol, `claim N` and one of `mean`, `low`, `high`, `p` (N counts the claims of the
-experiment from 1); or a JSON file and the keys into it, and last, if needed, a factor such as `* 1000`.
+is a whole table; `<!-- boards FOLDER -->` ranks the methods of a report as a leaderboard does, and
+`<!-- worth FOLDER -->` is the table of the documents of `inspect worth --json` in a folder beside all
+reports. Folders are those of reports below one root, such as `docs/results`. The keys of a number are
+folder, environment, protocol, method and a quantity (`final`, `shuffled`, `regret`, `normalized`, `fixed`,
+and `low` or `high`, the ends of the 95% interval of `final`); or folder, environment, protocol, `claim N`
+and one of `mean`, `low`, `high`, `p` (N counts the claims of the experiment from 1); or a JSON file and the
+keys into it, and last, if needed, a factor such as `* 1000`.
 """
 
 import re
@@ -26,7 +27,9 @@ from typing import Any, final
 from tcmrl_algo.experiment.aggregate import summarize
 from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.reporting import sections
+from tcmrl_algo.reporting.boards import gather
 from tcmrl_algo.reporting.claims import Verdict, judge
+from tcmrl_algo.reporting.leaderboard import returns_table
 from tcmrl_algo.reporting.sources import Source, read_sources
 from tcmrl_algo.reporting.worth import worth_table
 from tcmrl_data import TrainingError, Worth, parse_json
@@ -114,12 +117,18 @@ def _claims(pages: Pages, folder: str) -> str:
     return f"\n{sections.verdict_table('claims', judge(pages.source(folder))).markdown()}\n"
 
 
+def _boards(pages: Pages, folder: str) -> str:
+    boards = gather([pages.source(folder)])
+    parts = [f"On {board.environment}:\n\n{returns_table(board).markdown()}" for board in boards]
+    return "\n" + "\n\n".join(parts) + "\n"
+
+
 def _worth(pages: Pages, folder: str) -> str:
     return f"\n{worth_table(pages.worths(folder), pages.reports()).markdown()}\n"
 
 
 Block = Callable[[Pages, str], str]
-BLOCKS: dict[str, Block] = {"returns": _returns, "claims": _claims, "worth": _worth}
+BLOCKS: dict[str, Block] = {"returns": _returns, "claims": _claims, "boards": _boards, "worth": _worth}
 """What a table mark may ask for."""
 
 
