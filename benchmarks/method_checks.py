@@ -3,6 +3,9 @@
 Reads the finished runs of an experiment in one environment and prints JSON, of every method the mean over
 its runs:
 
+- Methods with an encoder: how often a context of EPISODES stored episodes lies nearest to the centroid of its
+  task's others, among NUM_TASKS training tasks and among the test tasks, with episodes of all snapshots, and
+  of every task's last.
 - CSRO: the share of the variance of representations z_t that a linear function of (s_t, a_t) explains, on
   other trajectories than those it was fitted on. Its penalty is to lower it.
 - UNICORN: the mean squared error of rewards that the decoder predicts from a task's own context, and from the
@@ -20,6 +23,7 @@ import json
 from pathlib import Path
 from statistics import fmean
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +33,7 @@ from tcmrl_algo.algorithms.borel.borel import BorelLearner, joined_episodes
 from tcmrl_algo.algorithms.csro import CsroLearner
 from tcmrl_algo.algorithms.macaw.macaw import MacawLearner
 from tcmrl_algo.algorithms.unicorn import UnicornLearner
+from tcmrl_algo.reporting.contexts import NUM_TASKS, centroid_accuracy
 from tcmrl_algo.reporting.sources import FinishedRun, read_sources
 from tcmrl_algo.training.checkpoint import RunRecord, open_run
 from tcmrl_algo.training.config import method_of
@@ -36,7 +41,34 @@ from tcmrl_data import Dataset, Steps, Trajectory
 
 TRAJECTORIES = 20
 """Stored trajectories of every task, half of them for contexts or fits."""
+EPISODES, CONTEXTS = 4, 20
+"""Episodes of a context, as of protocol `offline`, and contexts of a task."""
 Values = dict[str, float]
+
+
+def nearest_centroids(algorithm: ContextAlgorithm, dataset: Dataset) -> Values:
+    """Methods with an encoder: shares of contexts that are nearest to their own task's centroid."""
+    training = dataset.train_tasks
+    splits = {
+        "train": training[:: max(1, len(training) // NUM_TASKS)][:NUM_TASKS],
+        "test": dataset.test_tasks,
+    }
+    found = {}
+    for split, tasks in splits.items():
+        for snapshots in ("all", "last"):
+            random = np.random.default_rng(0)
+            lanes = []
+            for task in tasks:
+                stored = dataset.select(tasks=[task.index], snapshots=snapshots).trajectories(task.index)
+                draws = [random.choice(len(stored), EPISODES, replace=False) for _ in range(CONTEXTS)]
+                lanes += [[stored[index] for index in draw] for draw in draws]
+            contexts = algorithm.context(lanes).numpy()
+            accuracy = centroid_accuracy(contexts, np.repeat(np.arange(len(tasks)), CONTEXTS))
+            if (
+                accuracy is not None and np.ptp(contexts, axis=0).any()
+            ):  # the controls' contexts are all equal
+                found[f"nearest: {split}, {snapshots}"] = accuracy
+    return found
 
 
 def explained_by_states_and_actions(learner: CsroLearner, fitted_on: Steps, steps: Steps) -> Values:
@@ -99,8 +131,8 @@ def variances(learner: BorelLearner, steps: Steps, *, episodes: int) -> Values:
     return {f"after {place} steps": float(found[:, place].mean()) for place in places}
 
 
-def checks(run: FinishedRun) -> Values | None:
-    """The check of a finished run's method; None for a method without one."""
+def checks(run: FinishedRun) -> Values:
+    """The checks of a finished run's method; none for the controls."""
     opened = open_run(run.folder)
     dataset = opened.open_dataset()
     algorithm = create_algorithm(opened.record, dataset)
@@ -108,7 +140,7 @@ def checks(run: FinishedRun) -> Values | None:
     if isinstance(algorithm, MacawLearner):
         return gain_of_inner_step(algorithm, dataset, opened.record)
     if not isinstance(algorithm, ContextAlgorithm):
-        return None
+        return {}
     halves: tuple[list[list[Trajectory]], ...] = ([], [])
     for task in dataset.test_tasks:
         stored = dataset.select(tasks=[task.index]).trajectories(task.index)
@@ -116,15 +148,16 @@ def checks(run: FinishedRun) -> Values | None:
         for half, place in zip(halves, (0, 1), strict=True):
             half.append(chosen[place::2])
     first, second = (algorithm.pack(half) for half in halves)
+    found = nearest_centroids(algorithm, dataset)
     match algorithm.learner:
         case CsroLearner():
-            return explained_by_states_and_actions(algorithm.learner, first, second)
+            return found | explained_by_states_and_actions(algorithm.learner, first, second)
         case UnicornLearner():
-            return reward_errors(algorithm.learner, first, second)
+            return found | reward_errors(algorithm.learner, first, second)
         case BorelLearner():
             episodes = opened.record.config.method["episodes_per_belief"]
-            return variances(algorithm.learner, second, episodes=episodes)
-    return None
+            return found | variances(algorithm.learner, second, episodes=episodes)
+    return found
 
 
 def main() -> None:
@@ -138,7 +171,7 @@ def main() -> None:
     (source,) = read_sources([arguments.results], lambda *progress: None)
     for run in source.of(arguments.environment):
         values = checks(run)
-        if values is not None:
+        if values:
             found.setdefault(run.result.label, []).append(values)
     means = {
         label: {name: round(fmean(one[name] for one in runs), 4) for name in runs[0]} | {"runs": len(runs)}
