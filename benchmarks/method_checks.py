@@ -6,6 +6,8 @@ its runs:
 - Methods with an encoder: how often a context of EPISODES stored episodes lies nearest to the centroid of its
   task's others, among NUM_TASKS training tasks and among the test tasks, with episodes of all snapshots, and
   of every task's last.
+- The same methods: V halfway through last snapshots' episodes of these training tasks, under the task's own
+  context and under another's. Where the two are equal the critic reads the task from the state.
 - CSRO: the share of the variance of representations z_t that a linear function of (s_t, a_t) explains, on
   other trajectories than those it was fitted on. Its penalty is to lower it.
 - UNICORN: the mean squared error of rewards that the decoder predicts from a task's own context, and from the
@@ -20,6 +22,7 @@ rewards that are predicted from them.
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from statistics import fmean
 
@@ -37,7 +40,7 @@ from tcmrl_algo.reporting.contexts import NUM_TASKS, centroid_accuracy
 from tcmrl_algo.reporting.sources import FinishedRun, read_sources
 from tcmrl_algo.training.checkpoint import RunRecord, open_run
 from tcmrl_algo.training.config import method_of
-from tcmrl_data import Dataset, Steps, Trajectory
+from tcmrl_data import Dataset, Steps, Task, Trajectory
 
 TRAJECTORIES = 20
 """Stored trajectories of every task, half of them for contexts or fits."""
@@ -69,6 +72,30 @@ def nearest_centroids(algorithm: ContextAlgorithm, dataset: Dataset) -> Values:
             ):  # the controls' contexts are all equal
                 found[f"nearest: {split}, {snapshots}"] = accuracy
     return found
+
+
+def values_by_context(algorithm: ContextAlgorithm, dataset: Dataset) -> Values:
+    """Methods with an encoder: V of stored states under their own task's context, and under another's."""
+    stored = [
+        dataset.select(tasks=[task.index], snapshots="last").trajectories(task.index)
+        for task in _spread(dataset.train_tasks)
+    ]
+    contexts = algorithm.context([found[:EPISODES] for found in stored])
+    own: list[float] = []
+    another: list[float] = []
+    for place, found in enumerate(stored):
+        states = torch.stack(
+            [torch.as_tensor(one.observations[len(one.actions) // 2]) for one in found[EPISODES:][:CONTEXTS]]
+        )
+        scaled = algorithm.actor_critic.scaling(states.float())
+        for shift, values in ((0, own), *((shift, another) for shift in range(1, len(stored)))):
+            context = contexts[(place + shift) % len(stored)].expand(len(scaled), -1)
+            values.append(float(algorithm.actor_critic.value(torch.cat([scaled, context], dim=-1)).mean()))
+    return {"value: own": fmean(own), "value: another's": fmean(another)}
+
+
+def _spread(tasks: Sequence[Task]) -> Sequence[Task]:
+    return tasks[:: max(1, len(tasks) // NUM_TASKS)][:NUM_TASKS]
 
 
 def explained_by_states_and_actions(learner: CsroLearner, fitted_on: Steps, steps: Steps) -> Values:
@@ -149,6 +176,8 @@ def checks(run: FinishedRun) -> Values:
             half.append(chosen[place::2])
     first, second = (algorithm.pack(half) for half in halves)
     found = nearest_centroids(algorithm, dataset)
+    if found:
+        found |= values_by_context(algorithm, dataset)
     match algorithm.learner:
         case CsroLearner():
             return found | explained_by_states_and_actions(algorithm.learner, first, second)
