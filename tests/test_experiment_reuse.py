@@ -8,7 +8,7 @@ from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import ExperimentReport, run_experiment, tuned_settings
 from tcmrl_algo.experiment.config import Experiment, read_experiment
-from tcmrl_algo.experiment.planning import plan_runs
+from tcmrl_algo.experiment.planning import PlannedRun, plan_runs
 from tcmrl_algo.tuning.record import RECORD, Trial, Tuning
 from tcmrl_data import CheckpointError, TrainingError
 from tcmrl_data.foundation.records import write_record
@@ -98,7 +98,7 @@ def test_a_folder_without_results_is_refused(tiny_folder: Path, tmp_path: Path) 
 
 def _tune(folder: Path, name: str, *, trials: int = 2, score: float | None = 0.5) -> None:
     algorithm = name.rsplit("-", 1)[1]
-    values = {"optimizer.learning_rate": 0.002, f"{algorithm}.latent": 3}
+    values = {"optimizer.learning_rate": 0.002, "actor_critic.gamma": 0.7}
     ended = Trial(number=0, drawn={}, values={}, score=None if score is None else 0.1, error="diverged")
     best = Trial(number=1, drawn={}, values=values, score=score, error=None if score else "diverged")
     blank = Tuning(
@@ -121,21 +121,26 @@ def _tune(folder: Path, name: str, *, trials: int = 2, score: float | None = 0.5
     write_record(folder / name / RECORD, blank.with_trials([ended, best, *more]))
 
 
-def test_tuned_settings_lie_between_the_environments_changes_and_the_methods_own(
-    tiny_folder: Path, tmp_path: Path
-) -> None:
+def test_what_a_file_sets_goes_over_tuned_settings(tiny_folder: Path, tmp_path: Path) -> None:
     _tune(tmp_path, "point-robot-tcmrl")
     methods = {
         "tuned": {"algorithm": "tcmrl"},
-        "own": {"algorithm": "tcmrl", "training": {"tcmrl": {"latent": 5}}},
+        "own": {"algorithm": "tcmrl", "training": {"actor_critic": {"gamma": 0.5}}},
     }
     experiment = _experiment(tiny_folder, methods=methods)
     found = tuned_settings(experiment, tmp_path)
-    tuned, own = plan_runs(experiment, data=tmp_path, tuned=found)
-    assert (tuned.config.settings.optimizer.learning_rate, tuned.config.method["latent"]) == (0.002, 3)
-    assert (own.config.settings.optimizer.learning_rate, own.config.method["latent"]) == (0.002, 5)
-    assert tuned.tuned == own.tuned == found["point-robot"]["tcmrl"]
+    plans = plan_runs(experiment, data=tmp_path, tuned=found)
+    assert [_searched(plan) for plan in plans] == [(0.002, 0.7), (0.002, 0.5)]
+    assert plans[0].tuned == plans[1].tuned == found["point-robot"]["tcmrl"]
     assert (found["point-robot"]["tcmrl"].trials, found["point-robot"]["tcmrl"].score) == (2, 0.5)
+    place = {"dataset": str(tiny_folder), "training": {"optimizer": {"learning_rate": 0.1}}}
+    experiment = _experiment(tiny_folder, methods=methods, environments={"point-robot": place})
+    plans = plan_runs(experiment, data=tmp_path, tuned=found)
+    assert [_searched(plan) for plan in plans] == [(0.1, 0.7), (0.1, 0.5)]
+
+
+def _searched(plan: PlannedRun) -> tuple[float, float]:
+    return plan.config.settings.optimizer.learning_rate, plan.config.settings.actor_critic.gamma
 
 
 def test_an_environment_takes_the_tuning_that_it_names(tiny_folder: Path, tmp_path: Path) -> None:

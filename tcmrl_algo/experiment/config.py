@@ -49,7 +49,7 @@ class EnvironmentChoice(_Table):
         dataset: its folder; `NAME` below the folder of datasets where unset.
         dataset_profile: the profile that its dataset is built with; any where unset.
         profile: whose training table to start from; the one the dataset was built with where unset.
-        training: changes of that table.
+        training: changes of that table, also of settings that were tuned.
         tuning: of which environment the tuned settings are, in a run with some; its own where unset.
     """
 

@@ -190,16 +190,16 @@ def resolve_method(
     fallback: Mapping[str, Any] | None = None,
     tuned: Tuned | None = None,
 ) -> TrainingConfig:
-    """A method's configuration: the table, then changes of experiment, environment, tuning and method.
+    """A method's configuration: the table, then changes of tuning, experiment, environment and method.
 
     Raises:
         TrainingError: what results does not validate, or is shorter than the learning curve.
     """
     method = experiment.methods[label]
     texts = [
+        *(tuned.overrides if tuned else ()),
         *override_texts(experiment.training),
         *override_texts(experiment.environments[environment].training),
-        *(tuned.overrides if tuned else ()),
         *override_texts(method.training),
     ]
     if steps is not None:
