@@ -50,7 +50,8 @@ def test_the_list_of_datasets_fits_a_terminal_with_root_and_state_whole(shelf: P
         ("envs",),
         ("recipe", "point-robot", "--profile", "quick"),
         ("recipe", "walker-rand-params"),
-        ("plan", "half-cheetah-vel", "--profile", "quick"),
+        # it measures this machine for ten seconds, twice
+        pytest.param(("plan", "half-cheetah-vel", "--profile", "quick"), marks=pytest.mark.sweep),
         ("inspect", "returns", "DATASET"),
         ("inspect", "tasks", "DATASET"),
         ("inspect", "snapshots", "DATASET"),
