@@ -6,7 +6,9 @@ import pytest
 
 from benchmarks import recompute
 from tcmrl_algo.reporting.pages import Pages, unmarked_numbers
+from tcmrl_algo.reporting.returns import DatasetReturns, SnapshotReturns
 from tcmrl_data import TrainingError
+from tcmrl_data.foundation.records import write_record
 from tests import experiments
 from tests.experiments import made_result, write_results
 
@@ -22,7 +24,19 @@ def pages(tmp_path_factory: pytest.TempPathFactory) -> Pages:
         for method, values in finals.items()
         for seed, final in enumerate(values)
     ]
+    for result in results[:5]:
+        result.evaluations["offline"]["tasks"][0]["success"] = result.seed / 10
     write_results(root / "small", content, results)
+    stored = SnapshotReturns(step=None, train=1.0, test=4.0)
+    record = DatasetReturns(
+        environment="point-robot",
+        root="0" * 64,
+        profile="quick",
+        train_tasks=1,
+        test_tasks=1,
+        snapshots=(stored,),
+    )
+    write_record(root / "small" / "datasets" / "point-robot.json", record)
     (root / "speed.json").write_text('{"cases": [{"seconds": 0.0123}, {"seconds": 1234.5}]}')
     return Pages(root)
 
@@ -36,6 +50,8 @@ PLACE = "small; point-robot; offline"
         ("0.00", f"{PLACE}; TCMRL; final", "3.00"),
         ("7", f"{PLACE}; TCMRL; regret", "-3"),
         ("−7.0", f"{PLACE}; TCMRL; regret", "−3.0"),
+        ("0.00", f"{PLACE}; TCMRL; success", "0.20"),
+        ("0.00", f"{PLACE}; TCMRL; over dataset", "0.75"),
         ("0.0", f"{PLACE}; claim 1; low", "1.0"),  # 3 - 2.776 × 0.7071
         ("0.0", f"{PLACE}; claim 1; high", "5.0"),
         ("0.000", f"{PLACE}; claim 1; p", "0.026"),  # 0.0132 under each of two protocols
@@ -67,6 +83,7 @@ def test_a_marked_table_is_that_of_the_report(pages: Pages) -> None:
     [
         f"{PLACE}; TCMLR; final",
         f"{PLACE}; TCMRL; finale",
+        f"{PLACE}; no context; success",
         f"{PLACE}; claim 2; mean",
         "small; point-robot",
         "speed.json; cases; 2; seconds",

@@ -153,8 +153,7 @@ def _add_environment(page: Page, name: str, environment: str, found: Measured) -
     results = found.source.results(environment)
     page.text(f"### {environment}")
     page.table(sections.setup_table(f"{name}-setup", results))
-    kept = found.source.datasets.get(environment)
-    stored = None if kept is None else kept.test_return
+    stored = found.source.stored_return(environment)
     page.table(sections.final_table(f"{name}-returns", results, stored=stored))
     if known_scores(results, stored):
         page.text(SCORES)

@@ -13,15 +13,16 @@ is a whole table; `<!-- boards FOLDER -->` ranks the methods of a report as a le
 `<!-- worth FOLDER -->` is the table of the documents of `inspect worth --json` in a folder beside all
 reports. Folders are those of reports below one root, such as `docs/results`. The keys of a number are
 folder, environment, protocol, method and a quantity (`final`, `shuffled`, `regret`, `normalized`, `fixed`,
-and `low` or `high`, the ends of the 95% interval of `final`); or folder, environment, protocol, `claim N`
-and one of `mean`, `low`, `high`, `p` (N counts the claims of the experiment from 1); or a JSON file and the
-keys into it, and last, if needed, a factor such as `* 1000`.
+`success`, `over dataset`, and `low` or `high`, the ends of the 95% interval of `final`); or folder,
+environment, protocol, `claim N` and one of `mean`, `low`, `high`, `p` (N counts the claims of the experiment
+from 1); or a JSON file and the keys into it, and last, if needed, a factor such as `* 1000`.
 """
 
 import re
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache
 from pathlib import Path
+from statistics import fmean
 from typing import Any, final
 
 from tcmrl_algo.experiment.aggregate import summarize
@@ -30,6 +31,7 @@ from tcmrl_algo.reporting import sections
 from tcmrl_algo.reporting.boards import gather
 from tcmrl_algo.reporting.claims import Verdict, judge
 from tcmrl_algo.reporting.leaderboard import returns_table
+from tcmrl_algo.reporting.scores import known_scores
 from tcmrl_algo.reporting.sources import Source, read_sources
 from tcmrl_algo.reporting.worth import worth_table
 from tcmrl_data import TrainingError, Worth, parse_json
@@ -106,8 +108,7 @@ def unmarked_numbers(text: str) -> list[str]:
 def _returns(pages: Pages, folder: str) -> str:
     parts, source = [], pages.source(folder)
     for environment in source.environments():
-        kept = source.datasets.get(environment)
-        stored = None if kept is None else kept.test_return
+        stored = source.stored_return(environment)
         table = sections.final_table("returns", source.results(environment), stored=stored)
         parts.append(f"On {environment}:\n\n{table.markdown()}")
     return "\n" + "\n\n".join(parts) + "\n"
@@ -165,7 +166,7 @@ def _value(keys: Sequence[str], pages: Pages) -> float:
     runs = [result for result in source.results(environment) if result.method == subject]
     if not runs:
         raise LookupError(f"no run of {subject!r} on {environment!r}")
-    return _of_runs(runs, protocol, quantity)
+    return _of_runs(runs, protocol, quantity, source.stored_return(environment))
 
 
 def _of_verdict(verdict: Verdict, quantity: str) -> float:
@@ -176,10 +177,14 @@ def _of_verdict(verdict: Verdict, quantity: str) -> float:
     return value
 
 
-def _of_runs(runs: Sequence[RunResult], protocol: str, quantity: str) -> float:
+def _of_runs(runs: Sequence[RunResult], protocol: str, quantity: str, stored: float | None) -> float:
+    evaluations = [run.evaluations[protocol] for run in runs]
+    if score := known_scores(runs, stored).get(quantity):
+        known = [score(found) for found in evaluations]
+        return fmean(share for share in known if share is not None)
     ends = quantity in ("low", "high")
     name = "mean_final" if ends else f"mean_{quantity}"
-    summary = summarize([run.evaluations[protocol][name] for run in runs])
+    summary = summarize([found[name] for found in evaluations])
     value: float | None = getattr(summary, quantity) if ends else summary.mean
     if value is None:
         raise ValueError(f"fewer than five runs have no {quantity}")

@@ -75,6 +75,11 @@ class Source:
         """Results of the finished runs in an environment."""
         return [run.result for run in self.of(environment)]
 
+    def stored_return(self, environment: str) -> float | None:
+        """Mean return of the stored episodes of the test tasks; None where no report measured it."""
+        kept = self.datasets.get(environment)
+        return None if kept is None else kept.test_return
+
 
 def read_sources(
     paths: Sequence[Path], report: Callable[[str, int, int], None], *, datasets: Sequence[Path] = ()
