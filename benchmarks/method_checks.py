@@ -3,6 +3,8 @@
 Reads the finished runs of an experiment in one environment and prints JSON, of every method the mean over
 its runs:
 
+- All methods: the return of the policy adapted to stored trajectories, in training tasks and in test tasks.
+  Where the two are equal, what is missing was not learned, rather than not generalized.
 - Methods with an encoder: how often a context of EPISODES stored episodes lies nearest to the centroid of its
   task's others, among NUM_TASKS training tasks and among the test tasks, with episodes of all snapshots, and
   of every task's last.
@@ -30,7 +32,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tcmrl_algo import ContextAlgorithm, create_algorithm
+from tcmrl_algo import Algorithm, ContextAlgorithm, create_algorithm
 from tcmrl_algo.adaptation.arena import Arena, Context
 from tcmrl_algo.algorithms.borel.borel import BorelLearner, joined_episodes
 from tcmrl_algo.algorithms.csro import CsroLearner
@@ -47,6 +49,20 @@ TRAJECTORIES = 20
 EPISODES, CONTEXTS = 4, 20
 """Episodes of a context, as of protocol `offline`, and contexts of a task."""
 Values = dict[str, float]
+
+
+def returns_by_split(dataset: Dataset, arena: Arena) -> Values:
+    """Mean returns after adaptation to stored trajectories, in training and in test tasks."""
+    splits = {"train": _spread(dataset.train_tasks), "test": dataset.test_tasks}
+    return {
+        f"return: {split}": _mean_return(arena, tasks, [arena.stored(task, draw=0) for task in tasks])
+        for split, tasks in splits.items()
+    }
+
+
+def _mean_return(arena: Arena, tasks: Sequence[Task], contexts: Sequence[Context]) -> float:
+    episodes = arena.adapted(tasks, contexts, episode=0)
+    return fmean(float(episode.rewards.sum()) for episode in episodes)
 
 
 def nearest_centroids(algorithm: ContextAlgorithm, dataset: Dataset) -> Values:
@@ -130,24 +146,13 @@ def reward_errors(learner: UnicornLearner, context_steps: Steps, steps: Steps) -
     return {"own": error(own), "another": fmean(others)}
 
 
-def gain_of_inner_step(algorithm: MacawLearner, dataset: Dataset, record: RunRecord) -> Values:
+def gain_of_inner_step(dataset: Dataset, arena: Arena) -> Values:
     """MACAW: returns before and after the inner step."""
-    method, _ = method_of(record.config)
-    settings = record.config.settings.run
-    arena = Arena(dataset, algorithm, settings, capabilities=method.capabilities, seed=record.seed)
     tasks = dataset.test_tasks
-
-    def mean_return(contexts: list[Context]) -> float:
-        episodes = arena.adapted(tasks, contexts, episode=0)
-        return fmean(float(episode.rewards.sum()) for episode in episodes)
-
-    try:
-        return {
-            "before": mean_return([[] for _ in tasks]),
-            "after": mean_return([arena.stored(task, draw=0) for task in tasks]),
-        }
-    finally:
-        arena.close()
+    return {
+        "before": _mean_return(arena, tasks, [[] for _ in tasks]),
+        "after": _mean_return(arena, tasks, [arena.stored(task, draw=0) for task in tasks]),
+    }
 
 
 def variances(learner: BorelLearner, steps: Steps, *, episodes: int) -> Values:
@@ -159,15 +164,14 @@ def variances(learner: BorelLearner, steps: Steps, *, episodes: int) -> Values:
 
 
 def checks(run: FinishedRun) -> Values:
-    """The checks of a finished run's method; none for the controls."""
+    """The checks of a finished run's method."""
     opened = open_run(run.folder)
     dataset = opened.open_dataset()
     algorithm = create_algorithm(opened.record, dataset)
     algorithm.load_tensors(opened.newest().tensors())
-    if isinstance(algorithm, MacawLearner):
-        return gain_of_inner_step(algorithm, dataset, opened.record)
+    found = _acted(opened.record, algorithm, dataset)
     if not isinstance(algorithm, ContextAlgorithm):
-        return {}
+        return found
     halves: tuple[list[list[Trajectory]], ...] = ([], [])
     for task in dataset.test_tasks:
         stored = dataset.select(tasks=[task.index]).trajectories(task.index)
@@ -175,9 +179,9 @@ def checks(run: FinishedRun) -> Values:
         for half, place in zip(halves, (0, 1), strict=True):
             half.append(chosen[place::2])
     first, second = (algorithm.pack(half) for half in halves)
-    found = nearest_centroids(algorithm, dataset)
-    if found:
-        found |= values_by_context(algorithm, dataset)
+    nearest = nearest_centroids(algorithm, dataset)
+    if nearest:
+        found |= nearest | values_by_context(algorithm, dataset)
     match algorithm.learner:
         case CsroLearner():
             return found | explained_by_states_and_actions(algorithm.learner, first, second)
@@ -189,8 +193,20 @@ def checks(run: FinishedRun) -> Values:
     return found
 
 
+def _acted(record: RunRecord, algorithm: Algorithm, dataset: Dataset) -> Values:
+    """The checks for which the policy acts."""
+    method, _ = method_of(record.config)
+    settings = record.config.settings.run
+    arena = Arena(dataset, algorithm, settings, capabilities=method.capabilities, seed=record.seed)
+    try:
+        found = returns_by_split(dataset, arena)
+        return found | gain_of_inner_step(dataset, arena) if isinstance(algorithm, MacawLearner) else found
+    finally:
+        arena.close()
+
+
 def main() -> None:
-    """Prints the checks of all methods that have one."""
+    """Prints the checks of all methods."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("results", type=Path, help="results folder of an experiment")
     parser.add_argument("--environment", default="point-robot")
@@ -199,9 +215,7 @@ def main() -> None:
     found: dict[str, list[Values]] = {}
     (source,) = read_sources([arguments.results], lambda *progress: None)
     for run in source.of(arguments.environment):
-        values = checks(run)
-        if values:
-            found.setdefault(run.result.label, []).append(values)
+        found.setdefault(run.result.label, []).append(checks(run))
     means = {
         label: {name: round(fmean(one[name] for one in runs), 4) for name in runs[0]} | {"runs": len(runs)}
         for label, runs in found.items()
