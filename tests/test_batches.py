@@ -74,6 +74,14 @@ def test_contexts_from_the_same_snapshots_are_those_of_one_selection(tiny: Datas
                 assert found == [None, None] or torch.equal(*found), (n, part, field.name)
 
 
+def test_a_policy_that_learns_from_trajectories_alone_sees_all_snapshots(tiny: Dataset) -> None:
+    one = open_with(tiny, algorithm="borel")
+    two = open_with(tiny, "run.context_snapshots=last", algorithm="borel")
+    assert isinstance(two._batches, Sampler)
+    for n in range(10):
+        assert torch.equal(*(found.batch(n)["episodes"].rewards for found in (one, two)))
+
+
 def test_an_algorithm_without_contexts_draws_none(tiny: Dataset) -> None:
     alone = open_with(tiny, "run.context_snapshots=last", algorithm="no_context")
     assert isinstance(alone._batches, Sampler)

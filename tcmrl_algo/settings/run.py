@@ -34,8 +34,8 @@ class RunSettings(BaseModel):
         snapshots: which snapshots to learn from: `all`, `last`, `steps>=N`,
             `return>=Q` or `tier:NAME`.
         context_snapshots: which snapshots context and execution trajectories and windows come from, and
-            stored contexts in evaluation; those of `snapshots` if left out. The actor-critic's
-            transitions are always those of `snapshots`.
+            stored contexts in evaluation; those of `snapshots` if left out. What a policy learns from is
+            always of `snapshots`, also the trajectories of a method that requests nothing else (BOReL).
         threads: CPU threads of torch; results depend on it in their last bits.
         precision: in which hidden layers multiply; all else is float32. `bfloat16` is faster where the
             processor multiplies it in hardware, and changes results.
@@ -43,9 +43,10 @@ class RunSettings(BaseModel):
         checkpoint_every: steps between two checkpoints.
         protocol: how to adapt to test tasks (paper, section 4.2: `paper`).
         episodes: adaptation episodes per test task, of all protocols and all methods.
-        random_episodes: how many of them form the first stage: uniform actions under `paper`, tried contexts
-            of training tasks under `idaq_literal` (published code: one setting for both). 0 begins `paper`
-            with the prior of a method that needs no trajectories.
+        random_episodes: how many of them form the first stage: the method's exploration under `paper`, which
+            is uniform actions unless it has one of its own, and tried contexts of training tasks under
+            `idaq_literal` (published code: one setting for both). 0 begins `paper` with the prior of a
+            method that needs no trajectories.
         candidates: how many training tasks are drawn for every episode of the first stage of `idaq_literal`,
             of which the one with the most distant context is tried.
         repeats: how many times a protocol with a random first stage is run, by independent seeds; results

@@ -1,4 +1,7 @@
-"""The stream of batches that a run learns from; contexts may come from other snapshots than transitions."""
+"""The stream of batches that a run learns from; contexts may come from other snapshots than transitions.
+
+A method that requests no transitions learns its policy from trajectories, which are of `run.snapshots` then.
+"""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -72,8 +75,9 @@ def open_batches(
     transitions, contexts = split_request(
         requests[0]
     )  # of a stage with dense rewards, so that they are loaded
-    reads_contexts = any(split_request(request)[1].kinds for request in requests)
-    if run.context_snapshots is None or not reads_contexts:
+    halves = [split_request(request) for request in requests]
+    reads_both = any(half.kinds for half, _ in halves) and any(half.kinds for _, half in halves)
+    if run.context_snapshots is None or not reads_both:
         return StagedBatches(sampler(run.snapshots, requests[0]), stages)
     joined = JoinedBatches(sampler(run.snapshots, transitions), sampler(run.context_snapshots, contexts))
     return StagedBatches(joined, stages)

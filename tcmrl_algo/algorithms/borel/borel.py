@@ -18,8 +18,8 @@ Our inferences and choices:
 - The actor-critic is that of the other methods, where the published code has SAC, which on narrow offline
   data overestimates. Its rows are the steps of the same lanes; beliefs are computed anew for every batch,
   by one pass, and episodes are paired at random in each, so that relabelling needs no copy of the data.
-- Lanes hold as many trajectories as the recipe's largest context, rounded up to whole lanes: with the
-  recipes about as many transitions as the other methods' batches.
+- Lanes hold as many trajectories as the recipe's largest context, rounded up to whole lanes. In the plane
+  these are about as many transitions as in the other methods' batches, elsewhere several times as many.
 - Of all draws of t, `elbo_terms` per lane are decoded, which estimates the same sum. Values are
   standardised, and changes of state stand for next states.
 - Filtered are the first `episodes_per_belief` - 1 trajectories of a context and the episode that is run,
