@@ -60,7 +60,7 @@ class Evaluation:
         tasks: results by test task.
         adaptation_curve: mean returns of the first, second, … adaptation episode: how many episodes it
             takes until the policy is adapted. The episodes are those of the protocol; under `paper` the
-            first ones act uniformly.
+            first ones are the method's exploration, uniform actions unless it has one of its own.
         mean_final, mean_regret, mean_normalized, mean_shuffled, mean_behavior, mean_fixed: means of the
             tasks' values.
         privileged: whether the method is a control that observes the task parameters.

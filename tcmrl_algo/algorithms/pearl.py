@@ -4,10 +4,12 @@ Every transition gives a Gaussian factor, their product is q(z | c), and the enc
 both Q plus 0.1 KL(q || N(0, I)), summed over tasks and dimensions. V, the policy and targets see z detached.
 The actor-critic is ours; with the recipe's behavior regularisation it is "Batch PEARL" of later papers.
 
-Every episode has a z of its own: drawn from the prior while nothing is known, from the posterior afterwards.
+A z is drawn from the prior while nothing is known, and from the posterior whenever the context has grown.
 
-Our inference: the draw of an episode depends on the run's seed and on the number of trajectories alone, so
-that adaptation is deterministic and a task's context does not depend on its neighbours.
+Our inference: a draw from the posterior depends on the run's seed and on the number of trajectories alone, so
+that adaptation is deterministic and a task's context does not depend on its neighbours. Final episodes, all
+of which have contexts of one size, therefore share one standard normal draw, which other seeds draw anew. A
+draw from the prior depends on the lane's place besides.
 
 As in the published code, how much the divergence weighs depends on the scale of the rewards: the critics'
 losses grow with its square. Where a profile divides `actor_critic.reward_scale` by n, its `kl_weight` is
@@ -105,7 +107,7 @@ class PearlLearner(ContextLearner):
         return torch.stack([draws[number] for number in numbers.tolist()]).to(numbers.device)
 
     def explore(self, actor_critic: ActorCritic, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
-        """The policy under a context from the prior, anew for every episode and lane."""
+        """The policy under a context from the prior, by number of trajectories and place of the lane."""
         number, shape = max(map(len, trajectories)), (len(trajectories), self.latent)
         noise = torch.randn(shape, generator=self._problem.generator(number, PRIOR_STREAM))
         return actor_critic.controller(self._config.prior_std * noise.to(self._problem.device))

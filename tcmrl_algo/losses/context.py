@@ -228,7 +228,8 @@ def distance_metric_loss(contexts: Float[Tensor, "tasks examples latent"], *, ep
     """FOCAL's distance-metric loss (Li et al., 2021), inverse square: gathers each task's contexts.
 
     L = mean over pairs of one task of d^2 + mean over pairs of two tasks of 1 / (d^2 + epsilon), with
-    d^2 = |c_i - c_j|^2 / latent. Not in TCMRL's paper; in its published code.
+    d^2 = |c_i - c_j|^2 / latent. Attraction by d^2 is FOCAL's paper; the published codes of FOCAL and of
+    TCMRL, whose paper has no such loss, attract by sqrt(d^2 + 0.001), which near contexts feel more.
 
     Args:
         contexts: several contexts of every task.
