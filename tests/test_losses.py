@@ -63,6 +63,10 @@ DIFFERENTIABLE: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
         lambda c: losses.distance_metric_loss(c),
         (random(2, 2, 4),),
     ),
+    "distance_metric, root": (
+        lambda c: losses.distance_metric_loss(c, attraction="root"),
+        (random(2, 2, 4),),
+    ),
     "orthogonality": (losses.orthogonality_loss, (random(2, 3),)),
     "q": (
         lambda q: actor_critic.q_loss(q, NOISE[0], torch.zeros(3).double(), NOISE[1], gamma=0.9),
@@ -293,6 +297,16 @@ def test_distance_metric_by_hand() -> None:
     loss = losses.distance_metric_loss(contexts, epsilon=0.5)
     expected = (2.0 + 0.0) / 2 + (1 / 8.5 + 1 / 10.5) / 2  # d^2: 4/2 and 0 within; 16/2 and 20/2 between
     assert loss.item() == pytest.approx(expected, rel=1e-6)
+
+
+def test_distance_metric_of_the_published_code_by_hand() -> None:
+    alike = torch.zeros(2, 2, 3)
+    loss = losses.distance_metric_loss(alike, attraction="root")
+    assert loss.item() == pytest.approx(math.sqrt(1e-3) + 10.0)  # 0.0316228 within a task, 10 between two
+    contexts = torch.tensor([[[0.0], [2.0]], [[0.0], [0.0]]])
+    between = (1 / 0.1 + 1 / 0.1 + 1 / 4.1 + 1 / 4.1) / 4
+    expected = (math.sqrt(4.001) + math.sqrt(1e-3)) / 2 + between
+    assert losses.distance_metric_loss(contexts, attraction="root").item() == pytest.approx(expected)
 
 
 def test_orthogonality_by_hand() -> None:

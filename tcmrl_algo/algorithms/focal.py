@@ -1,6 +1,6 @@
 """FOCAL (Li et al., 2021): the mean of transition representations as context, trained by distances alone."""
 
-from typing import ClassVar, final
+from typing import ClassVar, Literal, final
 
 import torch
 from jaxtyping import Float
@@ -26,11 +26,14 @@ class FocalConfig(MethodConfig):
         latent: size of representations and contexts (published code of TCMRL: 20).
         encoder_hidden: widths of the context encoder (published code: 200 x 3).
         epsilon: bounds the repulsion of two tasks' contexts (published code: 0.1).
+        attraction: a task's contexts attract each other by `square`, d^2 (FOCAL's paper), or by `root`,
+            sqrt(d^2 + 0.001) (its published code).
     """
 
     latent: int = Field(default=20, ge=1)
     encoder_hidden: tuple[int, ...] = (200, 200, 200)
     epsilon: float = Field(default=0.1, gt=0)
+    attraction: Literal["square", "root"] = "square"
 
 
 @final
@@ -39,7 +42,7 @@ class FocalLearner(ContextLearner):
 
     def __init__(self, problem: Problem, config: FocalConfig, *, generator: torch.Generator) -> None:
         super().__init__()
-        self.latent, self._epsilon = config.latent, config.epsilon
+        self.latent, self._config = config.latent, config
         self.encoder = ContextEncoder(
             problem, latent=config.latent, hidden=config.encoder_hidden, generator=generator
         )
@@ -50,7 +53,11 @@ class FocalLearner(ContextLearner):
         representations = torch.cat(self.encoder(*groups), dim=1)
         mask = torch.cat([group.mask for group in groups], dim=1)
         single = mean_representation(representations.flatten(0, 1), mask.flatten(0, 1))
-        distance = losses.distance_metric_loss(single.unflatten(0, mask.shape[:2]), epsilon=self._epsilon)
+        distance = losses.distance_metric_loss(
+            single.unflatten(0, mask.shape[:2]),
+            epsilon=self._config.epsilon,
+            attraction=self._config.attraction,
+        )
         num_context = batch["context"].mask.shape[1]
         context = mean_representation(
             representations[:, :num_context].flatten(1, 2), mask[:, :num_context].flatten(1, 2)

@@ -224,7 +224,12 @@ def task_contrastive_loss(
     )
 
 
-def distance_metric_loss(contexts: Float[Tensor, "tasks examples latent"], *, epsilon: float = 0.1) -> Scalar:
+def distance_metric_loss(
+    contexts: Float[Tensor, "tasks examples latent"],
+    *,
+    epsilon: float = 0.1,
+    attraction: Literal["square", "root"] = "square",
+) -> Scalar:
     """FOCAL's distance-metric loss (Li et al., 2021), inverse square: gathers each task's contexts.
 
     L = mean over pairs of one task of d^2 + mean over pairs of two tasks of 1 / (d^2 + epsilon), with
@@ -234,13 +239,15 @@ def distance_metric_loss(contexts: Float[Tensor, "tasks examples latent"], *, ep
     Args:
         contexts: several contexts of every task.
         epsilon: bounds the repulsion (published code: 0.1).
+        attraction: `square`, d^2, or `root`, sqrt(d^2 + 0.001).
     """
     flat = contexts.flatten(0, 1)
     squares = (flat.unsqueeze(0) - flat.unsqueeze(1)).square().mean(dim=-1)
     tasks = torch.arange(len(contexts), device=flat.device).repeat_interleave(contexts.shape[1])
     same = tasks.unsqueeze(0) == tasks.unsqueeze(1)
     pairs = ~torch.eye(len(tasks), dtype=torch.bool, device=flat.device)
-    return masked_mean(squares, same & pairs) + masked_mean(1.0 / (squares + epsilon), ~same)
+    distances = squares if attraction == "square" else (squares + 1e-3).sqrt()
+    return masked_mean(distances, same & pairs) + masked_mean(1.0 / (squares + epsilon), ~same)
 
 
 def orthogonality_loss(weights: Float[Tensor, "lanes steps"]) -> Scalar:
