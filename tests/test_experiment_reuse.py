@@ -1,5 +1,7 @@
 """Experiments that take over trainings of others, and tuned settings."""
 
+import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -88,6 +90,24 @@ def test_another_training_or_curve_is_done(
     (result,) = run_experiment(_experiment(tiny_folder, **changes), tmp_path, reuse=[source[0]]).results
     assert result.training_of is None
     assert all(point.timed_steps > 0 for point in result.curve)
+
+
+def test_a_setting_newer_than_a_training_has_its_default_there(
+    source: tuple[Path, ExperimentReport], tiny_folder: Path, tmp_path: Path
+) -> None:
+    old = tmp_path / "old"
+    shutil.copytree(source[0], old)
+    (file,) = old.glob("runs/*.json")
+    document = json.loads(file.read_text())
+    del document["identity"]["training"]["actor_critic"]["cloning"]
+    file.write_text(json.dumps(document))
+    (again,) = run_experiment(_experiment(tiny_folder), old).results
+    assert again.digest == source[1].results[0].digest
+    (same,) = run_experiment(_experiment(tiny_folder), tmp_path / "same", reuse=[old]).results
+    assert same.training_of is not None
+    cloned = experiments.SMALL | {"actor_critic": {"hidden": [8], "cloning": 1.0}}
+    with pytest.raises(CheckpointError, match=r"actor_critic\.cloning 0\.0, this experiment has 1\.0"):
+        run_experiment(_experiment(tiny_folder, training=cloned), old)
 
 
 def test_a_folder_without_results_is_refused(tiny_folder: Path, tmp_path: Path) -> None:

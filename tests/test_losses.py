@@ -74,6 +74,10 @@ DIFFERENTIABLE: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
     ),
     "value": (lambda v: actor_critic.value_loss(v, NOISE[0]), (random(3),)),
     "policy": (lambda p, q: actor_critic.policy_loss(p, q, entropy=0.3), (random(3), random(3, seed=1))),
+    "cloning": (
+        lambda a: actor_critic.cloning_loss(a, torch.zeros(3, 2).double(), NOISE[0]),
+        (random(3, 2),),
+    ),
     "dual_divergence": (actor_critic.dual_divergence, (random(3), random(3, seed=1))),
     "gradient_penalty": (lambda g: actor_critic.gradient_penalty(2.0 * g), (random(3, 4),)),
 }
@@ -336,6 +340,15 @@ def test_value_and_policy_loss_by_hand() -> None:
     assert actor_critic.value_loss(torch.tensor([1.0, 3.0]), torch.tensor([2.0, 1.0])).item() == 2.5
     loss = actor_critic.policy_loss(torch.tensor([1.0, 3.0]), torch.tensor([4.0, 2.0]), entropy=0.5)
     assert loss.item() == -2.0  # ((0.5 - 4) + (1.5 - 2)) / 2
+
+
+def test_cloning_loss_by_hand() -> None:
+    acted, actions = torch.tensor([[0.5, 0.0], [1.0, -1.0]]), torch.tensor([[0.0, 0.0], [1.0, 0.5]])
+    q_values = torch.tensor([-2.0, 6.0], requires_grad=True)
+    loss = actor_critic.cloning_loss(acted.requires_grad_(), actions, q_values)
+    assert loss.item() == 2.5  # mean |Q| = 4, squared differences (0.25 + 0 + 0 + 2.25) / 4
+    loss.backward()
+    assert q_values.grad is None
 
 
 def test_dual_divergence_is_zero_where_the_estimated_ratio_is_one() -> None:

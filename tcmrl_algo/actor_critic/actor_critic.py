@@ -8,7 +8,7 @@ from torch import Tensor, nn
 
 from tcmrl_algo.actor_critic.brac import DualCritic
 from tcmrl_algo.actor_critic.rows import ConditionedRows
-from tcmrl_algo.losses.actor_critic import policy_loss, q_loss, value_loss
+from tcmrl_algo.losses.actor_critic import cloning_loss, policy_loss, q_loss, value_loss
 from tcmrl_algo.methods.base import Metrics
 from tcmrl_algo.methods.network_algorithm import FunctionController
 from tcmrl_algo.methods.problem import Problem
@@ -134,6 +134,10 @@ class ActorCritic(nn.Module):
         acted_values = call_frozen(self.critics, acted).amin(dim=0)
         targets = acted_values - settings.entropy * sample.log_probabilities
         actor_loss = policy_loss(sample.log_probabilities, acted_values, entropy=settings.entropy)
+        if settings.cloning > 0:
+            actor_loss = actor_loss + settings.cloning * cloning_loss(
+                sample.actions, rows.actions, acted_values
+            )
         metrics: Metrics = {}
         if self.brac is not None:
             divergences = self.brac.divergences(rows, acted)

@@ -47,13 +47,11 @@ class PlannedRun:
 
     def identity(self) -> dict[str, Any]:
         """Everything that the run's result is a function of, beside code, device and threads."""
-        config = self.config.model_dump(mode="json")
-        del config["settings"]["run"]["threads"]
         return {
             "root": self.root,
             "test_tasks": list(self.test_tasks),
             "seed": self.seed,
-            "training": config["settings"] | {self.config.settings.run.algorithm: config["method"]},
+            "training": training_tables(self.config),
             "protocols": list(self.protocols),
             "curve_points": self.curve_points,
         }
@@ -156,13 +154,28 @@ def _splits(experiment: Experiment, dataset: Dataset, views: Path | None) -> dic
     return dict(enumerate(fold_datasets(dataset, views, experiment.folds)))
 
 
+def training_tables(config: TrainingConfig) -> dict[str, Any]:
+    """The training part of an identity: all settings but for the number of threads."""
+    tables = config.settings.model_dump(mode="json")
+    del tables["run"]["threads"]
+    return tables | {config.settings.run.algorithm: config.method}
+
+
+def completed(identity: Mapping[str, Any]) -> Mapping[str, Any]:
+    """The identity of an earlier run; settings that are newer than the run have their defaults."""
+    try:
+        return {**identity, "training": training_tables(resolve(identity["training"], place="identity"))}
+    except TcmrlError:  # it has settings that are gone
+        return identity
+
+
 def check_same(done: Mapping[str, Any], planned: Mapping[str, Any], *, place: Path) -> None:
     """Refuses to go on with a run that was begun with other settings or data.
 
     Raises:
         CheckpointError: names the first value that differs.
     """
-    before, now = dict(_leaves(done)), dict(_leaves(planned))
+    before, now = dict(_leaves(completed(done))), dict(_leaves(planned))
     for key in sorted(before.keys() | now.keys()):
         if before.get(key) != now.get(key):
             raise CheckpointError(

@@ -6,6 +6,7 @@ from typing import Any
 
 from tcmrl_algo.experiment.config import experiment_of, run_id
 from tcmrl_algo.experiment.job import Curve, Job, SharedTraining
+from tcmrl_algo.experiment.planning import completed
 from tcmrl_algo.experiment.results import RunResult, read_results
 from tcmrl_algo.settings.run import EVALUATION_KEYS, LOGGING_KEYS
 from tcmrl_algo.training.checkpoint import open_run, write_run
@@ -27,7 +28,7 @@ def finished_trainings(folders: Iterable[str | Path]) -> Trained:
         for result in read_results(folder, experiment):
             run = folder / "runs" / run_id(result.environment, result.method, result.seed, result.fold)
             if result.identity and (run / "run.json").is_file():
-                found.append((result, run))
+                found.append((result.model_copy(update={"identity": completed(result.identity)}), run))
     return found
 
 
@@ -35,7 +36,8 @@ def take_over(job: Job, trained: Trained) -> Job:
     """The job with the tensors of an equal training in its folder; the job itself where there is none.
 
     Trainings are equal if dataset root, test tasks, seed, steps, device and all settings are, but for those
-    that only evaluation or logging read. The code is taken to be the same. A learning curve is taken over
+    that only evaluation or logging read; settings that are newer than a training have their defaults there.
+    The code is taken to be the same. A learning curve is taken over
     only from a run with points at the same steps, evaluated in the same way.
     """
     folder = Path(job.folder)

@@ -47,6 +47,19 @@ def policy_loss(
     return (entropy * log_probabilities - q_values).mean()
 
 
+def cloning_loss(
+    acted: Float[Tensor, "rows action"],
+    actions: Float[Tensor, "rows action"],
+    q_values: Float[Tensor, " rows"],
+) -> Scalar:
+    """The mean of |Q| times the mean squared difference of the policy's and the stored actions.
+
+    TD3+BC (Fujimoto & Gu, 2021, equations 3 and 4) divides Q by mean |Q| instead and multiplies it by 2.5: a
+    weight of 1 / 2.5 = 0.4 here, up to the scale of the whole loss. No gradient reaches mean |Q|.
+    """
+    return q_values.detach().abs().mean() * functional.mse_loss(acted, actions)
+
+
 def dual_divergence(
     behavior: Float[Tensor, " rows"], policy: Float[Tensor, " rows"]
 ) -> Float[Tensor, " rows"]:

@@ -27,6 +27,8 @@ class ActorCriticSettings(BaseModel):
             believe in states outside it).
         divergence_factor: training stops where some |Q| exceeds what the data's rewards allow this many times
             (ours; Q that diverges grows without end, so that the number hardly matters).
+        cloning: weight of the policy's squared distance from the stored actions, in units of mean |Q| (ours,
+            after TD3+BC, whose own is 0.4; 0: off).
         brac: behavior regularisation.
     """
 
@@ -43,4 +45,5 @@ class ActorCriticSettings(BaseModel):
     log_std_range: tuple[float, float] = (-20.0, 0.0)
     clip_targets: bool = True
     divergence_factor: float = Field(default=100.0, gt=1)
+    cloning: float = Field(default=0.0, ge=0)
     brac: BracSettings = BracSettings()

@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
+from tcmrl_algo.experiment.planning import training_tables
 from tcmrl_algo.methods.base import METHODS
 from tcmrl_algo.methods.search import SettingValue
 from tcmrl_algo.settings.run import PROTOCOL_GROUP
@@ -74,8 +75,6 @@ def plan_tuning(
     tasks = held_out_tasks(dataset) if held_out is None else checked_tasks(dataset, held_out)
     _check_references(dataset, tasks)
     space = space_on(config, METHODS.get(algorithm).search)
-    settings = config.settings.model_dump(mode="json")
-    del settings["run"]["threads"]
     tuning = Tuning(
         algorithm=algorithm,
         environment=dataset.name,
@@ -95,7 +94,7 @@ def plan_tuning(
             "seeds": list(seeds),
             "protocols": list(protocols),
             "held_out": list(tasks),
-            "training": settings | {algorithm: config.method},
+            "training": training_tables(config),
             "space": {key: dimension.model_dump(mode="json") for key, dimension in space.items()},
         },
         versions=_versions(),
