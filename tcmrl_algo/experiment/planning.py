@@ -163,6 +163,8 @@ def training_tables(config: TrainingConfig) -> dict[str, Any]:
 
 def completed(identity: Mapping[str, Any]) -> Mapping[str, Any]:
     """The identity of an earlier run; settings that are newer than the run have their defaults."""
+    if not identity:  # of a result that a report keeps
+        return identity
     try:
         return {**identity, "training": training_tables(resolve(identity["training"], place="identity"))}
     except TcmrlError:  # it has settings that are gone
