@@ -26,8 +26,9 @@ Our inferences and choices:
   since the GRU has seen no more in training; published tests end there too. With the latest trajectories in
   place of the first, beliefs drifted away from the task, episode by episode, on the policy's own data. The
   first episodes are collected by the same policy.
-- Rewards are not relabelled: the paper's remedy for tasks that data confound evaluates one task's reward
-  function on another's transitions, and no environment here gives a learner its tasks' reward functions.
+- The paper's remedy for tasks that data confound evaluates one task's reward function on another's episodes.
+  No learner here is given reward functions: a dataset is relabelled instead, by `tcmrl-data relabel`, which
+  refuses tasks that differ in more than rewards, and lanes then pair a task's own episodes with others'.
 - The belief-averaged reward is left out, as it is off in the published configurations, and the dense
   rewards of `actor_critic.rewards` are refused, since batches hold them for single transitions alone.
 """
