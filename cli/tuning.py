@@ -96,7 +96,8 @@ def tune(
 
     Every trial trains on the training tasks without some held-out ones, on which it is scored: 0 is the
     return of uniform actions, 1 that of the reference, the mean is over held-out tasks, protocols and seeds.
-    The method's file declares what is searched. Compare methods after equal numbers of trials.
+    The method's file declares what is searched; what --set sets is not. Compare methods after equal numbers
+    of trials.
 
     If the same command is run again, it keeps finished trials and continues interrupted runs; with a larger
     --trials it adds trials. The result is tuning.json in the folder. Needs Optuna: pip install 'tcmrl[tune]'.
@@ -105,6 +106,7 @@ def tune(
     Examples:
       tcmrl tune data/point-robot --algo tcmrl --trials 16 --steps 3000
       tcmrl tune data/point-robot --algo focal --trials 16 --steps 3000 --seeds 0,1
+      tcmrl tune data/point-robot --algo csro --trials 8 --set optimizer.learning_rate=0.001
     """
     from tcmrl_algo import tune_method
     from tcmrl_algo.experiment.config import PAPER_PROTOCOLS

@@ -23,6 +23,7 @@ from tcmrl_algo import (
     tune_method,
 )
 from tcmrl_algo.tuning.holding_out import checked_tasks, evenly_spaced, held_out_tasks
+from tcmrl_algo.tuning.plan import plan_tuning
 from tcmrl_algo.tuning.proposals import GENERATION, RANDOM_TRIALS, known_to, propose
 from tcmrl_algo.tuning.record import Trial
 from tcmrl_algo.tuning.space import Dimension, override_texts, space_on
@@ -303,6 +304,32 @@ def test_a_space_lies_around_the_tables_values(tiny: Dataset) -> None:
     ]:
         with pytest.raises(TrainingError, match=problem):
             space_on(config, {key: what})
+
+
+def test_what_is_set_is_not_searched(tiny: Dataset, tmp_path: Path) -> None:
+    def space(algorithm: str, *overrides: str) -> list[str]:
+        plan = plan_tuning(
+            tiny,
+            algorithm=algorithm,
+            profile="quick",
+            steps=None,
+            seeds=[0],
+            seed=0,
+            held_out=None,
+            protocols=["offline"],
+            overrides=overrides,
+        )
+        return list(plan.tuning.space)
+
+    own = ["csro.penalty", "csro.distance_weight"]
+    rate, entropy = "optimizer.learning_rate", "actor_critic.entropy"
+    assert space("csro") == [rate, entropy, *own]
+    assert space("csro", f"{rate}=2e-3", f"{entropy} = 0.3") == own
+    assert space("csro", "csro.epsilon=0.2", "csro.penalty=2.0") == [rate, entropy, "csro.distance_weight"]
+    assert space("tcmrl", "tcmrl.weights={distance=0.2}") == [rate, entropy, "tcmrl.reward_estimation"]
+    both = (f"{rate}=2e-3", f"{entropy}=0.3")
+    with pytest.raises(TrainingError, match="nothing is left to search of no_context"):
+        tune_method(tiny, tmp_path / "out", algorithm="no_context", trials=1, overrides=both)
 
 
 @pytest.mark.parametrize("profile", ["quick", "paper"])

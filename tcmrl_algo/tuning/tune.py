@@ -96,14 +96,15 @@ def tune_method(
         seed: of the proposals.
         held_out: training tasks to score on; a fifth of them, evenly spaced, if None.
         protocols: of evaluation.
-        overrides: `section.key=value` texts that all trials share.
+        overrides: `section.key=value` texts that all trials share; what they set is not searched.
         workers: runs at a time, which share the cores as threads; one per core if None.
         device: a torch device.
         report: called as trials end.
 
     Raises:
         SelectionError: too few training tasks, or held-out tasks that are none.
-        TrainingError: settings that do not validate, or a task without a return of uniform actions.
+        TrainingError: settings that do not validate or leave nothing to search, or a task without a return
+            of uniform actions.
         CheckpointError: the folder holds trials of other settings or data.
         MissingPackageError: Optuna is not installed.
 
