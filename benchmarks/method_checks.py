@@ -5,9 +5,9 @@ its runs:
 
 - All methods: the return of the policy adapted to stored trajectories, in training tasks and in test tasks.
   Where the two are equal, what is missing was not learned, rather than not generalized.
-- Methods with an encoder: how often a context of EPISODES stored episodes lies nearest to the centroid of its
-  task's others, among NUM_TASKS training tasks and among the test tasks, with episodes of all snapshots, and
-  of every task's last.
+- Methods with an encoder: how often a context of as many stored episodes as `--episodes` says lies nearest to
+  the centroid of its task's others, among NUM_TASKS training tasks and among the test tasks, with episodes of
+  all snapshots, and of every task's last.
 - The same methods: V halfway through last snapshots' episodes of these training tasks, under the task's own
   context and under another's. Where the two are equal the critic reads the task from the state.
 - CSRO: the share of the variance of representations z_t that a linear function of (s_t, a_t) explains, on
@@ -46,8 +46,8 @@ from tcmrl_data import Dataset, Steps, Task, Trajectory
 
 TRAJECTORIES = 20
 """Stored trajectories of every task, half of them for contexts or fits."""
-EPISODES, CONTEXTS = 4, 20
-"""Episodes of a context, as of protocol `offline`, and contexts of a task."""
+CONTEXTS = 20
+"""Contexts of a task, and states of a task under each of them."""
 Values = dict[str, float]
 
 
@@ -65,7 +65,7 @@ def _mean_return(arena: Arena, tasks: Sequence[Task], contexts: Sequence[Context
     return fmean(float(episode.rewards.sum()) for episode in episodes)
 
 
-def nearest_centroids(algorithm: ContextAlgorithm, dataset: Dataset) -> Values:
+def nearest_centroids(algorithm: ContextAlgorithm, dataset: Dataset, episodes: int) -> Values:
     """Methods with an encoder: shares of contexts that are nearest to their own task's centroid."""
     training = dataset.train_tasks
     splits = {
@@ -79,7 +79,7 @@ def nearest_centroids(algorithm: ContextAlgorithm, dataset: Dataset) -> Values:
             lanes = []
             for task in tasks:
                 stored = dataset.select(tasks=[task.index], snapshots=snapshots).trajectories(task.index)
-                draws = [random.choice(len(stored), EPISODES, replace=False) for _ in range(CONTEXTS)]
+                draws = [random.choice(len(stored), episodes, replace=False) for _ in range(CONTEXTS)]
                 lanes += [[stored[index] for index in draw] for draw in draws]
             contexts = algorithm.context(lanes).numpy()
             accuracy = centroid_accuracy(contexts, np.repeat(np.arange(len(tasks)), CONTEXTS))
@@ -90,18 +90,18 @@ def nearest_centroids(algorithm: ContextAlgorithm, dataset: Dataset) -> Values:
     return found
 
 
-def values_by_context(algorithm: ContextAlgorithm, dataset: Dataset) -> Values:
+def values_by_context(algorithm: ContextAlgorithm, dataset: Dataset, episodes: int) -> Values:
     """Methods with an encoder: V of stored states under their own task's context, and under another's."""
     stored = [
         dataset.select(tasks=[task.index], snapshots="last").trajectories(task.index)
         for task in _spread(dataset.train_tasks)
     ]
-    contexts = algorithm.context([found[:EPISODES] for found in stored])
+    contexts = algorithm.context([found[:episodes] for found in stored])
     own: list[float] = []
     another: list[float] = []
     for place, found in enumerate(stored):
         states = torch.stack(
-            [torch.as_tensor(one.observations[len(one.actions) // 2]) for one in found[EPISODES:][:CONTEXTS]]
+            [torch.as_tensor(one.observations[len(one.actions) // 2]) for one in found[episodes:][:CONTEXTS]]
         )
         scaled = algorithm.actor_critic.scaling(states.float())
         for shift, values in ((0, own), *((shift, another) for shift in range(1, len(stored)))):
@@ -163,8 +163,8 @@ def variances(learner: BorelLearner, steps: Steps, *, episodes: int) -> Values:
     return {f"after {place} steps": float(found[:, place].mean()) for place in places}
 
 
-def checks(run: FinishedRun) -> Values:
-    """The checks of a finished run's method."""
+def checks(run: FinishedRun, episodes: int) -> Values:
+    """The checks of a finished run's method, with contexts of as many episodes."""
     opened = open_run(run.folder)
     dataset = opened.open_dataset()
     algorithm = create_algorithm(opened.record, dataset)
@@ -179,17 +179,17 @@ def checks(run: FinishedRun) -> Values:
         for half, place in zip(halves, (0, 1), strict=True):
             half.append(chosen[place::2])
     first, second = (algorithm.pack(half) for half in halves)
-    nearest = nearest_centroids(algorithm, dataset)
+    nearest = nearest_centroids(algorithm, dataset, episodes)
     if nearest:
-        found |= nearest | values_by_context(algorithm, dataset)
+        found |= nearest | values_by_context(algorithm, dataset, episodes)
     match algorithm.learner:
         case CsroLearner():
             return found | explained_by_states_and_actions(algorithm.learner, first, second)
         case UnicornLearner():
             return found | reward_errors(algorithm.learner, first, second)
         case BorelLearner():
-            episodes = opened.record.config.method["episodes_per_belief"]
-            return found | variances(algorithm.learner, second, episodes=episodes)
+            joined = opened.record.config.method["episodes_per_belief"]
+            return found | variances(algorithm.learner, second, episodes=joined)
     return found
 
 
@@ -210,17 +210,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("results", type=Path, help="results folder of an experiment")
     parser.add_argument("--environment", default="point-robot")
+    parser.add_argument("--episodes", type=int, default=4, help="of a context; 4 as of protocol `offline`")
     arguments = parser.parse_args()
     torch.set_grad_enabled(False)
     found: dict[str, list[Values]] = {}
     (source,) = read_sources([arguments.results], lambda *progress: None)
     for run in source.of(arguments.environment):
-        found.setdefault(run.result.label, []).append(checks(run))
+        found.setdefault(run.result.label, []).append(checks(run, arguments.episodes))
     means = {
         label: {name: round(fmean(one[name] for one in runs), 4) for name in runs[0]} | {"runs": len(runs)}
         for label, runs in found.items()
     }
-    print(json.dumps({"environment": arguments.environment, "methods": means}, indent=1))
+    asked = {"environment": arguments.environment, "episodes": arguments.episodes}
+    print(json.dumps(asked | {"methods": means}, indent=1))
 
 
 if __name__ == "__main__":

@@ -226,6 +226,23 @@ def test_the_loss_is_the_weighed_sum_and_reaches_every_network() -> None:
     assert min(gradients(made, found.total, parts).values()) > 0
 
 
+def test_the_actor_critic_learns_from_no_more_steps_of_a_task_than_asked() -> None:
+    given, capped, free = batch(), learner(policy_steps=7), learner()
+    everything = losses_of(free, given, step=5)
+    found = losses_of(capped, given, step=5)
+    assert found.steps is not None and everything.steps is not None
+    kept, real = found.steps.mask.flatten(1), everything.steps.mask.flatten(1)
+    assert real.sum(dim=1).min() > 7
+    assert kept.sum(dim=1).tolist() == [7] * len(kept) and not (kept & ~real).any()
+    assert torch.equal(found.steps.rewards, everything.steps.rewards)
+    assert found.context is not None and everything.context is not None
+    assert torch.equal(found.context, everything.context)
+    other = losses_of(capped, given, step=6).steps
+    assert other is not None and (other.mask.flatten(1) != kept).any()
+    enough = losses_of(learner(policy_steps=int(real.sum(dim=1).max())), given, step=5).steps
+    assert enough is not None and torch.equal(enough.mask.flatten(1), real)
+
+
 def test_states_are_relabelled_by_the_belief_before_and_the_next_ones_by_the_belief_after_a_step() -> None:
     made = learner()
     found = losses_of(made, batch(), step=5)

@@ -19,7 +19,8 @@ Our inferences and choices:
   data overestimates. Its rows are the steps of the same lanes; beliefs are computed anew for every batch,
   by one pass, and episodes are paired at random in each, so that relabelling needs no copy of the data.
 - Lanes hold as many trajectories as the recipe's largest context, rounded up to whole lanes. In the plane
-  these are about as many transitions as in the other methods' batches, elsewhere several times as many.
+  these are about as many transitions as in the other methods' batches; where episodes are long, recipes let
+  the actor-critic learn from as many of them as other methods do (`policy_steps`).
 - Of all draws of t, `elbo_terms` per lane are decoded, which estimates the same sum. Values are
   standardised, and changes of state stand for next states.
 - Filtered are the first `episodes_per_belief` - 1 trajectories of a context and the episode that is run,
@@ -35,7 +36,7 @@ Our inferences and choices:
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any, ClassVar, final
 
 import torch
@@ -92,7 +93,17 @@ class BorelLearner(ContextLearner):
             context = self.beliefs(lanes)[1].context.unflatten(0, shape[:2])
         before, after = context[:, :, :-1], context[:, :, 1:]
         metrics = {"belief/spread": after[lanes.mask].std(dim=0).mean()}
-        return ContextLosses(context.new_zeros(()), before, metrics, after, steps=lanes)
+        learned_from = self._learned_from(lanes, generator)
+        return ContextLosses(context.new_zeros(()), before, metrics, after, steps=learned_from)
+
+    def _learned_from(self, lanes: Steps, generator: torch.Generator) -> Steps:
+        """The lanes with a mask that leaves the actor-critic the steps that it learns from."""
+        most, mask = self._config.policy_steps, lanes.mask.flatten(1)
+        if most is None or most >= mask.shape[1]:
+            return lanes
+        order = torch.rand(mask.shape, generator=generator).to(mask.device)
+        last = torch.where(mask, order, torch.inf).kthvalue(most, dim=1, keepdim=True).values
+        return replace(lanes, mask=(mask & (order <= last)).unflatten(1, lanes.mask.shape[1:]))
 
     def beliefs(self, lanes: Steps) -> tuple[StepValues, Beliefs]:
         """The steps' values, of all lanes of all tasks, and the beliefs before and after all steps."""
