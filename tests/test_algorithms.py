@@ -155,11 +155,31 @@ def test_contexts_follow_the_order_of_tasks(name: str) -> None:
         return
     made.train(1, STEPS)
     steps, order = batch()["context"], [2, 0, 1]
-    fields = {field: getattr(steps, field) for field in steps.__dataclass_fields__}
-    turned = Steps(**{field: None if value is None else value[order] for field, value in fields.items()})
     with torch.no_grad():
-        plain, found = (made.algorithm.learner.context(values) for values in (steps, turned))
+        plain, found = (made.algorithm.learner.context(values) for values in (steps, of_tasks(steps, order)))
     torch.testing.assert_close(found, plain[order])
+
+
+@pytest.mark.parametrize("name", ["borel", "corro", "csro", "focal", "focal_plus", "tcmrl"])
+def test_contexts_of_training_follow_the_order_of_tasks(name: str) -> None:
+    """Of the methods whose contexts have no noise in training."""
+    made = Made(name)
+    assert isinstance(made.algorithm, ContextAlgorithm)
+    made.train(1, STEPS - 1)
+    plain, order = made.batch(STEPS), [2, 0, 1]
+    turned = Batch(plain.task_indices[order], {kind: of_tasks(plain[kind], order) for kind in plain.names()})
+    contexts = [
+        made.algorithm.learner.losses(values, STEPS, torch.Generator().manual_seed(0)).context
+        for values in (plain, turned)
+    ]
+    assert contexts[0] is not None and contexts[1] is not None
+    torch.testing.assert_close(contexts[1], contexts[0][order])
+
+
+def of_tasks(values: Steps, order: list[int]) -> Steps:
+    """The steps of some tasks, in this order."""
+    fields = {field: getattr(values, field) for field in values.__dataclass_fields__}
+    return Steps(**{field: None if value is None else value[order] for field, value in fields.items()})
 
 
 @every

@@ -1,5 +1,6 @@
 """BOReL: beliefs along joined episodes, the losses that train them, relabelled states, and the controller."""
 
+import itertools
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from tcmrl_algo import create_algorithm, open_run, resolve_for, train_run
 from tcmrl_algo.algorithms.borel.belief import StepValues
-from tcmrl_algo.algorithms.borel.borel import Borel, BorelLearner, joined_episodes
+from tcmrl_algo.algorithms.borel.borel import Borel, BorelLearner, _each, joined_episodes
 from tcmrl_algo.algorithms.borel.config import BorelConfig
 from tcmrl_algo.context_methods.learner import ContextAlgorithm
 from tcmrl_algo.losses.beliefs import belief_divergence, belief_reconstruction
@@ -107,6 +108,10 @@ def test_episodes_of_a_group_follow_one_another_without_their_padding() -> None:
     expected = torch.cat([given.observations[0, 2], given.observations[0, 3, :2]])
     assert torch.equal(found.observations[0, 1, :5], expected)
     assert torch.equal(found.rewards[0, 0, :3], given.rewards[0, [0, 0, 1], [0, 1, 0]])
+    ended = torch.zeros(1, 4, 3)
+    ended[0, 0, 1] = ended[0, 3, 1] = 1.0  # within the first lane, and at the end of the second
+    joined = joined_episodes(replace(given, mask=mask, terminated=ended), 2).terminated
+    assert joined[0].nonzero().tolist() == [[0, 1], [1, 4]]
     assert found.returns_to_go is None
 
 
@@ -250,6 +255,23 @@ def test_states_are_relabelled_by_the_belief_before_and_the_next_ones_by_the_bel
     assert found.context.shape == (3, 1, 12, 4) and not found.context.requires_grad
     torch.testing.assert_close(found.context[:, :, 1:], found.next_context[:, :, :-1])
     assert torch.equal(found.steps.mask, joined_episodes(batch()["episodes"], 2).mask)
+
+
+def test_beliefs_are_those_of_every_lane_alone_whatever_the_order_of_tasks() -> None:
+    """Two lanes of two episodes for each of three tasks."""
+    made, given = learner(), steps(3, 4, 6, seed=7, lengths=(6, 4, 5))
+    everything = Batch(torch.tensor([0, 1, 2]), {"episodes": given})
+    found = losses_of(made, everything, step=5).context
+    assert found is not None and found.shape == (3, 2, 12, 4)
+    for task, lane in itertools.product(range(3), range(2)):
+        alone = _each(given, lambda values, t=task, n=lane: values[t : t + 1, 2 * n : 2 * n + 2])
+        expected = made.beliefs(joined_episodes(alone, 2))[1].context[0, :-1]
+        torch.testing.assert_close(found[task, lane], expected)
+    order = torch.tensor([2, 0, 1])
+    turned = Batch(order, {"episodes": _each(given, lambda values: values[order])})
+    turned_context = losses_of(made, turned, step=5).context
+    assert turned_context is not None
+    torch.testing.assert_close(turned_context, found[order])
 
 
 def test_a_changes_decoder_does_not_read_what_it_predicts() -> None:

@@ -197,6 +197,16 @@ def test_noise_has_the_given_standard_deviation_in_its_unit(
     torch.testing.assert_close(noise.std(dim=(0, 1)), torch.tensor(expected), atol=0.0, rtol=0.03)
 
 
+def test_noise_in_the_datas_unit_leaves_alone_what_hardly_varies_there() -> None:
+    config = CorroConfig(negatives="change_noise")
+    constant = replace(problem(stages=stages_of("change_noise")), change_std=torch.tensor([0.5, 0.5, 1e-6]))
+    maker = CorroLearner(constant, config, generator=torch.Generator().manual_seed(0))
+    given = queries()
+    drawn = maker.negatives(given, torch.Generator().manual_seed(0))
+    varies = (drawn != given.unsqueeze(1)).flatten(0, 1).any(dim=0)
+    assert varies.tolist() == [False] * (STATE_ACTION + 1) + [True, True, False]
+
+
 @pytest.mark.parametrize("negatives", KINDS)
 def test_the_gradient_comes_through_queries_keys_and_negatives_and_never_through_the_vae(
     negatives: str,

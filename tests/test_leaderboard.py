@@ -14,7 +14,7 @@ from tcmrl_algo.experiment.compact import write_compact
 from tcmrl_algo.experiment.config import run_id
 from tcmrl_algo.experiment.results import RunResult, Tuned, success_rate
 from tcmrl_algo.reporting.boards import Board, Entry, gather
-from tcmrl_algo.reporting.leaderboard import leaderboard, listed_folders, ranks_table
+from tcmrl_algo.reporting.leaderboard import alike, leaderboard, listed_folders, ranks_table
 from tcmrl_algo.reporting.scores import over_dataset
 from tcmrl_algo.reporting.sections import final_table, published_table
 from tcmrl_algo.reporting.sources import Source, read_sources
@@ -83,10 +83,25 @@ def test_results_of_different_datasets_are_ranked_apart(tmp_path: Path) -> None:
     second = _experiment(tmp_path, "second", _runs("A", 5.0, root=OTHER_ROOT))
     boards = gather(_sources(first, second))
     assert [(board.root, _labels(board)) for board in boards] == [("0" * 64, ["A", "B"]), (OTHER_ROOT, ["A"])]
-    table = ranks_table("x", boards)
-    assert [row[:3] for row in table.rows] == [("B", 1.0, "1 of 2"), ("A", 1.5, "2 of 2")]
     text = page_text(leaderboard(_sources(first, second), tmp_path))
     assert f"## point-robot, dataset {'f' * 12}" in text and "results on 1 more datasets" in text
+    assert "mean rank | ranked" not in text
+
+
+def test_mean_ranks_are_over_boards_that_rank_the_same_methods(tmp_path: Path) -> None:
+    both = [
+        _experiment(tmp_path, name, [*_runs("A", first, root=root), *_runs("B", 2.0, latent=4, root=root)])
+        for name, first, root in (("low", 1.0, "1" * 64), ("high", 3.0, "2" * 64), ("higher", 4.0, "3" * 64))
+    ]
+    alone = _experiment(tmp_path, "alone", _runs("A", 5.0, root=OTHER_ROOT))
+    boards = gather(_sources(*both, alone))
+    shared, single = alike(boards)
+    assert ([board.root[0] for board in shared], single) == (["1", "2", "3"], [boards[3]])
+    table = ranks_table("x", shared)
+    assert [row[:3] for row in table.rows] == [("A", 4 / 3, "3 of 3"), ("B", 5 / 3, "3 of 3")]
+    written = write_leaderboard([*both, alone], tmp_path / "board")
+    assert "Over point-robot, dataset 111111111111, point-robot, dataset 222" in written.report.read_text()
+    assert (tmp_path / "board/leaderboard-ranks.csv").read_text() == table.csv()
 
 
 def test_folds_are_a_board_of_their_own(tmp_path: Path) -> None:

@@ -356,6 +356,8 @@ def test_dual_divergence_is_zero_where_the_estimated_ratio_is_one() -> None:
     assert actor_critic.dual_divergence(one, one).tolist() == pytest.approx([0.0] * 5, abs=1e-12)
     two = torch.full((5,), math.log(math.e**2 - 1.0), dtype=torch.float64)
     assert actor_critic.dual_divergence(one, two).tolist() == pytest.approx([math.log(2.0)] * 5)
+    zero = torch.zeros(5, dtype=torch.float64)  # 1 - ln 2 + ln ln 2
+    assert actor_critic.dual_divergence(zero, zero).tolist() == pytest.approx([-0.0596601] * 5, abs=1e-6)
     assert torch.isfinite(
         actor_critic.dual_divergence(one, torch.full((5,), -1e4, dtype=torch.float64))
     ).all()

@@ -130,6 +130,8 @@ def test_it_collects_under_contexts_from_the_prior_that_change_by_lane_and_episo
     again = made.explore([[], []]).act(STATES, NOISE)
     np.testing.assert_array_equal(first, again)
     assert not np.allclose(first[0], first[1])
+    many = made.explore([[] for _ in range(50)]).act(np.repeat(STATES[:1], 50, axis=0), NOISE)
+    np.testing.assert_allclose(many[0], first[0], rtol=1e-5)  # however many other lanes there are
     lanes = [[trajectory(6, 0)], [trajectory(6, 1)]]
     others = [[trajectory(6, 2)], [trajectory(6, 3)]]
     second = made.explore(lanes).act(STATES, NOISE)

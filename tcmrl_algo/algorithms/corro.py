@@ -57,7 +57,7 @@ from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
 from tcmrl_algo.methods.stages import Stage
 from tcmrl_algo.networks.attention import Attention
-from tcmrl_algo.networks.perceptron import Perceptron
+from tcmrl_algo.networks.perceptron import SMALLEST_SCALE, Perceptron
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Windows
 
@@ -178,6 +178,8 @@ class CorroLearner(ContextLearner):
         scale[slice(0, 1) if config.negatives == "reward_noise" else slice(1, None)] = config.noise
         if config.noise_unit == "raw":
             scale = scale / self.encoder.scaling.scale[self.encoder.state_action :]
+        else:  # what hardly varies in the data is not divided: noise there would tell negatives from the rest
+            scale[1:][problem.change_std < SMALLEST_SCALE] = 0.0
         self.register_buffer("noise_scale", scale, persistent=False)
 
     def parts(self, stage: str) -> Sequence[str]:

@@ -9,9 +9,10 @@ A step trains q on detached z_t first; then its outputs, held fixed, give L_club
 encoder through z_t alone. The actor-critic, ours as for FOCAL, sees detached contexts.
 
 Deviations: the published meta-batch holds every task once, so that L_distance there only repels; `positives`
-chooses between that and the equation. The published code squashes the variance of q together with its mean,
-by oversight, yet lambda was chosen with it: if the variance is free to fall, L_club grows without bound as q
-learns, and lambda 25 made all contexts equal on the point robot within 400 steps. See `variance`.
+chooses between that and the equation, where contexts of a task attract by d^2, as in FOCAL's paper. The
+published code squashes the variance of q together with its mean, by oversight, yet lambda was chosen with it:
+if the variance is free to fall, L_club grows without bound as q learns, and lambda 25 made all contexts equal
+on the point robot within 400 steps. See `variance`.
 """
 
 import math

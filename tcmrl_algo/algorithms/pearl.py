@@ -4,16 +4,17 @@ Every transition gives a Gaussian factor, their product is q(z | c), and the enc
 both Q plus 0.1 KL(q || N(0, I)), summed over tasks and dimensions. V, the policy and targets see z detached.
 The actor-critic is ours; with the recipe's behavior regularisation it is "Batch PEARL" of later papers.
 
-A z is drawn from the prior while nothing is known, and from the posterior whenever the context has grown.
+A z is drawn from the prior in the first episodes of a protocol, of which there may be many (published code:
+one or two), and then from the posterior whenever the context has grown.
 
 Our inference: a draw from the posterior depends on the run's seed and on the number of trajectories alone, so
 that adaptation is deterministic and a task's context does not depend on its neighbours. Final episodes, all
 of which have contexts of one size, therefore share one standard normal draw, which other seeds draw anew. A
-draw from the prior depends on the lane's place besides.
+draw from the prior depends besides on the lane's place among those that are stepped together.
 
 As in the published code, how much the divergence weighs depends on the scale of the rewards: the critics'
 losses grow with its square. Where a profile divides `actor_critic.reward_scale` by n, its `kl_weight` is
-divided by n squared; otherwise the posterior collapses to the prior, whatever the data.
+divided by n squared, or is smaller by experiment; otherwise the posterior collapses to the prior.
 """
 
 from collections.abc import Sequence
@@ -108,8 +109,9 @@ class PearlLearner(ContextLearner):
 
     def explore(self, actor_critic: ActorCritic, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
         """The policy under a context from the prior, by number of trajectories and place of the lane."""
-        number, shape = max(map(len, trajectories)), (len(trajectories), self.latent)
-        noise = torch.randn(shape, generator=self._problem.generator(number, PRIOR_STREAM))
+        generator = self._problem.generator(max(map(len, trajectories)), PRIOR_STREAM)
+        # One by one: a larger draw would not begin with the numbers of a smaller one.
+        noise = torch.stack([torch.randn(self.latent, generator=generator) for _ in trajectories])
         return actor_critic.controller(self._config.prior_std * noise.to(self._problem.device))
 
 

@@ -10,7 +10,9 @@ of s_{t+1} - s_t and of r_t from (z, s_t, a_t), for the steps that were encoded.
 cross-entropy of the task, which a classifier reads from z. The actor-critic is ours and sees detached
 contexts.
 
-Deviations: the encoder reads no end of the episode, and the decoders' targets are standardised. The code of
+Deviations: the encoder reads no end of the episode, and the decoders' targets are standardised. Contexts of a
+task attract by d^2, as in FOCAL's paper, and every task has several; in the published code a task is repeated
+only where it is drawn twice. The code of
 the supervised variant is not public: its classifier is ours, its encoder that of the other variant. Published
 code adds noise at test too; here contexts are means over that noise, so that adaptation is deterministic.
 """

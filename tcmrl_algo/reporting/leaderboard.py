@@ -29,10 +29,11 @@ NOTE = """\
 Returns are undiscounted, after adaptation, means over test tasks and runs; behind them stands the 95% \
 bootstrap interval over runs, or, with fewer than five runs, the values of all. Only results on one dataset \
 (equal roots) and one kind of split are ranked together. Ranks are by mean return, 1 is best, and equal \
-returns share a rank; where intervals overlap, a rank says little. A method has a mean rank over the boards \
-and protocols that it was evaluated on, and `ranked` says on how many: mean ranks over different boards do \
-not compare. `(privileged)` methods observe the task parameters and have no rank. FOCAL under \
-`idaq_literal` is IDAQ."""
+returns share a rank; where intervals overlap, a rank says little. Mean ranks are over the boards that rank \
+the same methods, and `ranked` says over how many boards and protocols: mean ranks over different ones do \
+not compare. Where half of the episodes are random, `paper` and `non_prior` are one procedure for every \
+method that explores by uniform actions, and count twice. `(privileged)` methods observe the task parameters \
+and have no rank. FOCAL under `idaq_literal` is IDAQ."""
 EFFORT = """\
 Milliseconds per training step, also relative to FOCAL's on the same dataset, and the most memory of the \
 process or, on CUDA, of the device; runs that shared a machine are slower. Episodes are those of adaptation, \
@@ -97,7 +98,10 @@ def leaderboard(sources: Sequence[Source], out: Path) -> Page:
     ]
     if missing:
         page.text(f"Runs are missing: {', '.join(missing)}.")
-    page.table(ranks_table(f"{NAME}-ranks", boards))
+    groups = [group for group in alike(boards) if len(group) > 1]
+    for number, group in enumerate(groups, start=1):
+        page.text(f"Over {', '.join(board.title for board in group)}:")
+        page.table(ranks_table(f"{NAME}-ranks{f'-{number}' if len(groups) > 1 else ''}", group))
     page.figure(NAME, "returns by method, protocol and dataset", _drawing(boards))
     for board in boards:
         page.text(f"## {board.title}")
@@ -116,6 +120,15 @@ def leaderboard(sources: Sequence[Source], out: Path) -> Page:
     page.text(EFFORT)
     page.data(all_table(NAME, boards))
     return page
+
+
+def alike(boards: Sequence[Board]) -> list[list[Board]]:
+    """The boards in groups that rank the same methods, the most methods first."""
+    groups: dict[frozenset[str], list[Board]] = {}
+    for board in boards:
+        ranked = frozenset(label for protocol in board.protocols for label in board.ranks(protocol))
+        groups.setdefault(ranked, []).append(board)
+    return [groups[ranked] for ranked in sorted(groups, key=len, reverse=True)]
 
 
 def ranks_table(name: str, boards: Sequence[Board]) -> Table:

@@ -16,6 +16,9 @@ class IdaqProtocol(Protocol):
 
     Four fifths of the episodes try the contexts of evenly spaced training tasks, one per episode. The other
     episodes use the best episode so far as their context, and keep that context if the return is higher.
+
+    Ours, without random draws. `idaq_literal` is the published procedure, which tries the most distant of
+    randomly drawn training tasks, and then lets contexts grow by the best episodes.
     """
 
     name = "idaq"

@@ -10,7 +10,9 @@ from tcmrl_data import Task, Trajectory
 
 @final
 class PaperProtocol(Protocol):
-    """Collects random episodes, then episodes of the policy with all earlier episodes as its context.
+    """Collects episodes as the method explores, then those of the policy with all earlier ones as context.
+
+    Methods explore by uniform actions, but for those that say otherwise.
 
     Deviation: in the second stage, too, the policy takes its most likely action, without noise. With
     `random_episodes = 0`, a method that needs no trajectories starts from its prior.

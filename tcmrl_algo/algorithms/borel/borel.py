@@ -18,15 +18,16 @@ Our inferences and choices:
 - The actor-critic is that of the other methods, where the published code has SAC, which on narrow offline
   data overestimates. Its rows are the steps of the same lanes; beliefs are computed anew for every batch,
   by one pass, and episodes are paired at random in each, so that relabelling needs no copy of the data.
-- Lanes hold as many trajectories as the recipe's largest context, rounded up to whole lanes. In the plane
-  these are about as many transitions as in the other methods' batches; where episodes are long, recipes let
-  the actor-critic learn from as many of them as other methods do (`policy_steps`).
+- Lanes hold as many trajectories as the recipe's largest context, rounded up to whole lanes. Where these have
+  many more transitions than the other methods' batches, recipes let the actor-critic learn from as many as
+  those have (`policy_steps`).
 - Of all draws of t, `elbo_terms` per lane are decoded, which estimates the same sum. Values are
   standardised, and changes of state stand for next states.
 - Filtered are the first `episodes_per_belief` - 1 trajectories of a context and the episode that is run,
   since the GRU has seen no more in training; published tests end there too. With the latest trajectories in
   place of the first, beliefs drifted away from the task, episode by episode, on the policy's own data. The
   first episodes are collected by the same policy.
+- Rewards are decoded from (z, s, a, s') everywhere (published code, where rewards are sparse: from z and s').
 - The paper's remedy for tasks that data confound evaluates one task's reward function on another's episodes.
   No learner here is given reward functions: a dataset is relabelled instead, by `tcmrl-data relabel`, which
   refuses tasks that differ in more than rewards, and lanes then pair a task's own episodes with others'.
@@ -166,7 +167,7 @@ class BorelLearner(ContextLearner):
         return BeliefController(self, actor_critic, self.filtered(steps))
 
     def explore(self, actor_critic: ActorCritic, trajectories: Sequence[Sequence[Trajectory]]) -> Controller:
-        """The policy, whose belief starts from the prior: it was trained to act under any belief."""
+        """The policy: it was trained to act under any belief, the prior of a first episode among them."""
         if self._config.explore == "uniform":
             return UniformController()
         with torch.no_grad():

@@ -24,8 +24,8 @@ class BorelConfig(MethodConfig):
         reconstruction: whether a prediction's errors are a `mean` over steps (published code) or their `sum`
             (paper), which makes the divergences weigh less.
         episodes_per_belief: episodes of a task that are filtered one after the other (published code: 2).
-        explore: who collects before there are data: the `policy` under a belief that starts from the prior
-            (published code), or `uniform` actions (ours).
+        explore: who collects the first episodes: the `policy`, whose belief starts from the prior, and later
+            from that after the first episode (published code), or `uniform` actions (ours).
         policy_steps: most steps of a task that the actor-critic learns from at once, drawn from its lanes
             (published code: 256); all of them where unset.
         vae_share: share of all steps that train the belief; the others train the policy (ours).

@@ -6,10 +6,10 @@ A value network phi and a policy theta, whose layers are weight-linear, take one
     theta' = theta - rate grad mean [-w log pi_theta(a | s) + c (h_theta(s, a) - A)^2],
 
 where G is the return to go, A = G + gamma^(T-t) V_phi'(s_T) - V_phi'(s), w grows with A, and h is a head on
-the policy's last hidden layer, so that the inner gradient tells advantages apart. The outer losses, on other
-transitions of the task, are those of V_phi', with targets that bootstrap from 0.9 phi + 0.1 phi', and of
-pi_theta' without the head. Their gradients pass through the inner steps (second order) to phi, theta, h, c
-and a rate per parameter tensor.
+the policy's last hidden layer, so that the inner gradient tells advantages apart. The outer losses are those
+of V_phi', with targets that bootstrap from 0.9 phi + 0.1 phi', and of pi_theta' without the head, on
+transitions that are drawn apart from the context and may be among it (in the paper they are others). Their
+gradients pass through the inner steps (second order) to phi, theta, h, c and a rate per parameter tensor.
 
 Nothing loops over tasks: all lanes take their step at once, by `torch.func`, and a step on the parameters of
 a layer is computed, exactly, as what it makes of the layer's weights (`networks/weight_linear.py`).
