@@ -50,7 +50,8 @@ class EnvironmentChoice(_Table):
         dataset_profile: the profile that its dataset is built with; any where unset.
         profile: whose training table to start from; the one the dataset was built with where unset.
         training: changes of that table, also of settings that were tuned.
-        tuning: of which environment the tuned settings are, in a run with some; its own where unset.
+        tuning: how the folders of its tunings begin, in a run with some: another environment, or any name;
+            its own name where unset.
     """
 
     dataset: str | None = None
