@@ -74,7 +74,7 @@ tcmrl.add_command(tune)
     "--steps",
     type=click.IntRange(min=1),
     show_default="run.steps",
-    help="Step to stop at; schedules still use run.steps.",
+    help="Step to stop at; schedules and stages still have the length of run.steps.",
 )
 @click.option("--device", show_default="cpu", help="PyTorch device, such as cpu or cuda.")
 @click.option(

@@ -156,7 +156,8 @@ def test_contexts_follow_the_order_of_tasks(name: str) -> None:
     made.train(1, STEPS)
     steps, order = batch()["context"], [2, 0, 1]
     with torch.no_grad():
-        plain, found = (made.algorithm.learner.context(values) for values in (steps, of_tasks(steps, order)))
+        plain = made.algorithm.learner.context(steps)
+        found = made.algorithm.learner.context(steps.map(lambda values: values[order]))
     torch.testing.assert_close(found, plain[order])
 
 
@@ -167,19 +168,14 @@ def test_contexts_of_training_follow_the_order_of_tasks(name: str) -> None:
     assert isinstance(made.algorithm, ContextAlgorithm)
     made.train(1, STEPS - 1)
     plain, order = made.batch(STEPS), [2, 0, 1]
-    turned = Batch(plain.task_indices[order], {kind: of_tasks(plain[kind], order) for kind in plain.names()})
+    kinds = {kind: plain[kind].map(lambda values: values[order]) for kind in plain.names()}
+    turned = Batch(plain.task_indices[order], kinds)
     contexts = [
         made.algorithm.learner.losses(values, STEPS, torch.Generator().manual_seed(0)).context
         for values in (plain, turned)
     ]
     assert contexts[0] is not None and contexts[1] is not None
     torch.testing.assert_close(contexts[1], contexts[0][order])
-
-
-def of_tasks(values: Steps, order: list[int]) -> Steps:
-    """The steps of some tasks, in this order."""
-    fields = {field: getattr(values, field) for field in values.__dataclass_fields__}
-    return Steps(**{field: None if value is None else value[order] for field, value in fields.items()})
 
 
 @every

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tcmrl_algo import create_algorithm, open_run, resolve_for, train_run
 from tcmrl_algo.algorithms.borel.belief import StepValues
-from tcmrl_algo.algorithms.borel.borel import Borel, BorelLearner, _each, joined_episodes
+from tcmrl_algo.algorithms.borel.borel import Borel, BorelLearner, joined_episodes
 from tcmrl_algo.algorithms.borel.config import BorelConfig
 from tcmrl_algo.context_methods.learner import ContextAlgorithm
 from tcmrl_algo.losses.beliefs import belief_divergence, belief_reconstruction
@@ -264,11 +264,11 @@ def test_beliefs_are_those_of_every_lane_alone_whatever_the_order_of_tasks() -> 
     found = losses_of(made, everything, step=5).context
     assert found is not None and found.shape == (3, 2, 12, 4)
     for task, lane in itertools.product(range(3), range(2)):
-        alone = _each(given, lambda values, t=task, n=lane: values[t : t + 1, 2 * n : 2 * n + 2])
+        alone = given.map(lambda values, t=task, n=lane: values[t : t + 1, 2 * n : 2 * n + 2])
         expected = made.beliefs(joined_episodes(alone, 2))[1].context[0, :-1]
         torch.testing.assert_close(found[task, lane], expected)
     order = torch.tensor([2, 0, 1])
-    turned = Batch(order, {"episodes": _each(given, lambda values: values[order])})
+    turned = Batch(order, {"episodes": given.map(lambda values: values[order])})
     turned_context = losses_of(made, turned, step=5).context
     assert turned_context is not None
     torch.testing.assert_close(turned_context, found[order])

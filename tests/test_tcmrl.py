@@ -186,11 +186,8 @@ def test_order_of_tasks_changes_no_context_and_no_loss() -> None:
     made, order = learner({"negative_noise": 0.0}), torch.tensor([2, 0, 1])
     plain = batch()
 
-    def permuted(values: Steps) -> Steps:
-        fields = {name: getattr(values, name) for name in values.__dataclass_fields__}
-        return Steps(**{name: None if field is None else field[order] for name, field in fields.items()})
-
-    moved = with_steps(plain, context=permuted(plain["context"]), execution=permuted(plain["execution"]))
+    kinds = {kind: plain[kind].map(lambda values: values[order]) for kind in ("context", "execution")}
+    moved = with_steps(plain, **kinds)
     first, second = losses_of(made, plain), losses_of(made, moved)
     torch.testing.assert_close(first.context[order], second.context)
     torch.testing.assert_close(first.total, second.total)

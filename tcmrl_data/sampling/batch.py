@@ -1,7 +1,7 @@
 """Meta-training batches, and statistics of the data."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -42,6 +42,11 @@ class Steps:
     discounts_to_end: Tensor | None = None
     final_observations: Tensor | None = None
     times: Tensor | None = None
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> "Steps":
+        """The steps with all their tensors changed."""
+        given = {field.name: getattr(self, field.name) for field in fields(self)}
+        return Steps(**{name: None if value is None else change(value) for name, value in given.items()})
 
 
 @dataclass(frozen=True)

@@ -36,8 +36,8 @@ Our inferences and choices:
 """
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import fields, replace
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, final
 
 import torch
@@ -153,7 +153,7 @@ class BorelLearner(ContextLearner):
     def filtered(self, steps: Steps) -> Float[Tensor, "lanes hidden"]:
         """The GRU's state after the first `episodes_per_belief` - 1 trajectories of every lane."""
         number = min(steps.mask.shape[1], self._config.episodes_per_belief - 1)
-        first = _each(steps, lambda values: values[:, :number])
+        first = steps.map(lambda values: values[:, :number])
         lanes = joined_episodes(first, number)
         states = self.encoder.states_along(self._values(lanes))
         last = lanes.mask.sum(dim=-1).view(-1, 1, 1).expand(-1, 1, states.shape[-1])
@@ -222,16 +222,7 @@ def joined_episodes(steps: Steps, episodes: int) -> Steps:
         flat = values.reshape(tasks, groups, width, *values.shape[3:])
         return flat.gather(2, order.reshape(*order.shape, *[1] * (flat.ndim - 3)).expand_as(flat))
 
-    return _each(steps, joined)
-
-
-def _each(steps: Steps, change: Callable[[Tensor], Tensor]) -> Steps:
-    """The steps with all their tensors changed."""
-    given = {field.name: getattr(steps, field.name) for field in fields(steps)}
-    found: dict[str, Any] = {
-        name: None if values is None else change(values) for name, values in given.items()
-    }
-    return Steps(**found)
+    return steps.map(joined)
 
 
 @final
