@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -46,7 +47,10 @@ class Steps:
     def map(self, change: Callable[[Tensor], Tensor]) -> "Steps":
         """The steps with all their tensors changed."""
         given = {field.name: getattr(self, field.name) for field in fields(self)}
-        return Steps(**{name: None if value is None else change(value) for name, value in given.items()})
+        changed: dict[str, Any] = {
+            name: None if value is None else change(value) for name, value in given.items()
+        }
+        return Steps(**changed)
 
 
 @dataclass(frozen=True)
