@@ -290,7 +290,19 @@ def test_batches_hold_whole_lanes(contexts: tuple[int, ...], expected: int) -> N
     shared = shared.model_copy(
         update={"batch": shared.batch.model_copy(update={"context_trajectories": contexts})}
     )
-    assert Borel().batch_request(shared, BorelConfig()).kinds == {"episodes": Trajectories(expected)}
+    method = Borel()
+    assert method.batch_request(shared, BorelConfig()).kinds == {"episodes": Trajectories(expected)}
+    belief, policy = method.stages(shared, BorelConfig(policy_lanes=5, episodes_per_belief=2))
+    assert belief.request.kinds == {"episodes": Trajectories(expected)}
+    assert policy.request.kinds == {"episodes": Trajectories(10)}
+    assert method.stages(shared, BorelConfig())[1].request == belief.request
+
+
+def test_the_steps_that_the_actor_critic_learns_from_are_of_all_lanes() -> None:
+    made, given = learner(policy_steps=12), steps(3, 8, 6, seed=7, lengths=(6, 4, 5))
+    found = losses_of(made, Batch(torch.tensor([0, 1, 2]), {"episodes": given}), step=5).steps
+    assert found is not None and found.mask.shape == (3, 4, 12)
+    assert found.mask.sum(dim=(1, 2)).tolist() == [12] * 3 and found.mask.any(dim=2).all()
 
 
 def test_dense_rewards_are_refused() -> None:

@@ -18,9 +18,9 @@ Our inferences and choices:
 - The actor-critic is that of the other methods, where the published code has SAC, which on narrow offline
   data overestimates. Its rows are the steps of the same lanes; beliefs are computed anew for every batch,
   by one pass, and episodes are paired at random in each, so that relabelling needs no copy of the data.
-- Lanes hold as many trajectories as the recipe's largest context, rounded up to whole lanes. Where these have
-  many more transitions than the other methods' batches, recipes let the actor-critic learn from as many as
-  those have (`policy_steps`).
+- Lanes hold as many trajectories as the recipe's largest context, rounded up to whole lanes. Where one lane
+  has many more transitions than the other methods' batches, recipes let the actor-critic learn from as many
+  as those have (`policy_steps`), drawn from several lanes (`policy_lanes`): steps of one lane are too alike.
 - Of all draws of t, `elbo_terms` per lane are decoded, which estimates the same sum. Values are
   standardised, and changes of state stand for next states.
 - Filtered are the first `episodes_per_belief` - 1 trajectories of a context and the episode that is run,
@@ -236,19 +236,23 @@ class Borel(Method[BorelConfig]):
 
     def batch_request(self, settings: TrainingSettings, config: BorelConfig) -> BatchRequest:
         """Whole lanes of trajectories, as many as the recipe's largest context."""
-        groups = math.ceil(max(settings.batch.context_trajectories) / config.episodes_per_belief)
-        return BatchRequest(
-            settings.batch.tasks, {"episodes": Trajectories(groups * config.episodes_per_belief)}
-        )
+        lanes = math.ceil(max(settings.batch.context_trajectories) / config.episodes_per_belief)
+        return _lanes_of_tasks(settings, config, lanes)
 
     def stages(self, settings: TrainingSettings, config: BorelConfig) -> tuple[Stage, ...]:
-        request = self.batch_request(settings, config)
+        request = policy = self.batch_request(settings, config)
+        if config.policy_lanes is not None:
+            policy = _lanes_of_tasks(settings, config, config.policy_lanes)
         steps = max(1, round(config.vae_share * settings.run.steps))
         return (
             Stage(BELIEF_STAGE, steps, request),
-            Stage(POLICY_STAGE, settings.run.steps - steps, request),
+            Stage(POLICY_STAGE, settings.run.steps - steps, policy),
         )
 
     def create(self, problem: Problem, settings: TrainingSettings, config: BorelConfig) -> Algorithm:
         learner = BorelLearner(problem, config, generator=problem.generator(0))
         return ContextAlgorithm(problem, settings, learner=learner)
+
+
+def _lanes_of_tasks(settings: TrainingSettings, config: BorelConfig, lanes: int) -> BatchRequest:
+    return BatchRequest(settings.batch.tasks, {"episodes": Trajectories(lanes * config.episodes_per_belief)})
