@@ -183,6 +183,13 @@ def test_missing_unequal_and_failed_tunings_are_refused(
     _tune(tmp_path, "point-robot-focal", trials=3)
     with pytest.raises(TrainingError, match=r"equal effort"):
         tuned_settings(_experiment(tiny_folder, methods=both), tmp_path)
+    fixed = {"optimizer": {"learning_rate": 1e-3}, "actor_critic": {"entropy": 0.1}}
+    control = {"algorithm": "no_context", "training": fixed}
+    found = tuned_settings(_experiment(tiny_folder, methods=METHODS | {"no context": control}), tmp_path)
+    assert list(found["point-robot"]) == ["tcmrl"]
+    control = control | {"training": {"optimizer": fixed["optimizer"]}}
+    with pytest.raises(TrainingError, match="point-robot-no_context holds no tuning"):
+        tuned_settings(_experiment(tiny_folder, methods=METHODS | {"no context": control}), tmp_path)
     _tune(tmp_path / "failed", "point-robot-tcmrl", score=None)
     with pytest.raises(TrainingError, match="no trial ended well"):
         tuned_settings(_experiment(tiny_folder), tmp_path / "failed")

@@ -22,11 +22,12 @@ from tcmrl_algo import (
     resolve_for,
     tune_method,
 )
+from tcmrl_algo.experiment.config import override_texts
 from tcmrl_algo.tuning.holding_out import checked_tasks, evenly_spaced, held_out_tasks
 from tcmrl_algo.tuning.plan import plan_tuning
 from tcmrl_algo.tuning.proposals import GENERATION, RANDOM_TRIALS, known_to, propose
 from tcmrl_algo.tuning.record import Trial
-from tcmrl_algo.tuning.space import Dimension, override_texts, space_on
+from tcmrl_algo.tuning.space import Dimension, space_on
 from tcmrl_data import Dataset, SelectionError, TrainingError
 from tcmrl_data.foundation.errors import CheckpointError, MissingPackageError
 from tcmrl_data.store.part_record import References
@@ -296,7 +297,7 @@ def test_a_space_lies_around_the_tables_values(tiny: Dataset) -> None:
     assert space["tcmrl.weights.distance"].options == (0.1, 1.0)
     rate = space["optimizer.learning_rate"]
     assert (rate.own, rate.value(1.0), rate.value(1.23456)) == (1e-3, 1e-3, 0.00123)
-    assert override_texts({"a.b": 0.5, "c": "x"}) == ("a.b=0.5", 'c="x"')
+    assert list(override_texts({"a.b": 0.5, "c": "x"})) == ["a.b=0.5", 'c="x"']
     for key, what, problem in [
         ("tcmrl.wieghts.negative", Factors(0.5, 2.0), "no setting"),
         ("tcmrl.weights", Options((1.0,)), "no setting"),
@@ -342,7 +343,7 @@ def test_every_end_of_every_methods_space_validates(name: str, profile: Any, tin
         ends = dimension.options if dimension.kind == "options" else (dimension.low, dimension.high)
         for drawn in ends:
             assert drawn is not None
-            texts = override_texts({key: dimension.value(drawn)})
+            texts = list(override_texts({key: dimension.value(drawn)}))
             changed = resolve_for(tiny, profile=profile, algorithm=name, overrides=texts)
             assert (changed == config) is (dimension.value(drawn) == dimension.own)
 

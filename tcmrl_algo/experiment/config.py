@@ -146,6 +146,11 @@ class Experiment(_Table):
                     )
         return self
 
+    def overrides(self, environment: str, label: str) -> tuple[str, ...]:
+        """What the file sets for a method in an environment, as the texts that `resolve` takes."""
+        tables = (self.training, self.environments[environment].training, self.methods[label].training)
+        return tuple(text for table in tables for text in override_texts(table))
+
     @property
     def fold_numbers(self) -> tuple[int | None, ...]:
         """The folds; (None,) for the dataset's own split."""

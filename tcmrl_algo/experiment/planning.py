@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
-from tcmrl_algo.experiment.config import Experiment, override_texts, run_id
+from tcmrl_algo.experiment.config import Experiment, run_id
 from tcmrl_algo.experiment.datasets import fold_datasets, open_datasets
 from tcmrl_algo.experiment.results import Tuned
 from tcmrl_algo.training.config import TrainingConfig, installed_table, resolve
@@ -211,12 +211,7 @@ def resolve_method(
         TrainingError: what results does not validate, or is shorter than the learning curve.
     """
     method = experiment.methods[label]
-    texts = [
-        *(tuned.overrides if tuned else ()),
-        *override_texts(experiment.training),
-        *override_texts(experiment.environments[environment].training),
-        *override_texts(method.training),
-    ]
+    texts = [*(tuned.overrides if tuned else ()), *experiment.overrides(environment, label)]
     if steps is not None:
         texts.append(f"run.steps={steps}")
     config = resolve(table, place=place, algorithm=method.algorithm, overrides=texts, fallback=fallback)

@@ -5,15 +5,16 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
+from tcmrl_algo.experiment.config import override_texts
 from tcmrl_algo.experiment.planning import training_tables
 from tcmrl_algo.methods.base import METHODS
-from tcmrl_algo.methods.search import Search, SettingValue
+from tcmrl_algo.methods.search import SettingValue
 from tcmrl_algo.settings.run import PROTOCOL_GROUP
 from tcmrl_algo.training.config import TrainingConfig, resolve_for
 from tcmrl_algo.training.train import PACKAGES
 from tcmrl_algo.tuning.holding_out import checked_tasks, held_out_tasks
 from tcmrl_algo.tuning.record import Tuning
-from tcmrl_algo.tuning.space import override_texts, space_on
+from tcmrl_algo.tuning.space import searched, space_on
 from tcmrl_data import Dataset, Profile, TrainingError
 from tcmrl_data.foundation.errors import MissingPackageError
 from tcmrl_data.foundation.plugins import check_declared
@@ -74,7 +75,7 @@ def plan_tuning(
         check_declared(PROTOCOL_GROUP, "protocol", protocol)
     tasks = held_out_tasks(dataset) if held_out is None else checked_tasks(dataset, held_out)
     _check_references(dataset, tasks)
-    space = space_on(config, _searched(METHODS.get(algorithm).search, overrides))
+    space = space_on(config, searched(METHODS.get(algorithm).search, overrides))
     if not space:
         raise TrainingError(f"nothing is left to search of {algorithm}; set fewer of its settings")
     tuning = Tuning(
@@ -102,12 +103,6 @@ def plan_tuning(
         versions=_versions(),
     )
     return TuningPlan(dataset, texts, tuning)
-
-
-def _searched(search: Search, overrides: Sequence[str]) -> Search:
-    """The space without the settings, or tables of settings, that an override gives a value."""
-    fixed = tuple(f"{text.partition('=')[0].strip()}." for text in overrides)
-    return {key: what for key, what in search.items() if not f"{key}.".startswith(fixed)}
 
 
 def _versions() -> dict[str, str]:

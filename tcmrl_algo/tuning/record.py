@@ -6,8 +6,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from tcmrl_algo.experiment.config import override_texts
 from tcmrl_algo.methods.search import SettingValue
-from tcmrl_algo.tuning.space import Dimension, override_texts
+from tcmrl_algo.tuning.space import Dimension
 from tcmrl_data import Profile
 from tcmrl_data.foundation.records import read_record
 
@@ -62,7 +63,7 @@ class Trial(_Record):
     @property
     def overrides(self) -> tuple[str, ...]:
         """The settings as texts that `tcmrl train --set` takes."""
-        return override_texts(self.values)
+        return tuple(override_texts(self.values))
 
 
 class Tuning(_Record):

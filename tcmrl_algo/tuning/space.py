@@ -1,7 +1,6 @@
 """A method's search space on one training table: what a trial may draw, and the values that this gives."""
 
-import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
@@ -73,9 +72,10 @@ def space_on(config: TrainingConfig, search: Search) -> dict[str, Dimension]:
     return space
 
 
-def override_texts(values: Mapping[str, SettingValue]) -> tuple[str, ...]:
-    """Settings as the texts that `tcmrl train --set` takes; JSON values are TOML values."""
-    return tuple(f"{key}={json.dumps(value)}" for key, value in values.items())
+def searched(search: Search, overrides: Sequence[str]) -> Search:
+    """The search without the settings, or tables of settings, that an override gives a value."""
+    fixed = tuple(f"{text.partition('=')[0].strip()}." for text in overrides)
+    return {key: what for key, what in search.items() if not f"{key}.".startswith(fixed)}
 
 
 def _value_at(table: Mapping[str, Any], key: str, algorithm: str) -> SettingValue:

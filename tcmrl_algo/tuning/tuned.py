@@ -5,7 +5,9 @@ from pathlib import Path
 
 from tcmrl_algo.experiment.config import Experiment
 from tcmrl_algo.experiment.results import Tuned
+from tcmrl_algo.methods.base import METHODS
 from tcmrl_algo.tuning.record import RECORD, Tuning, read_tuning
+from tcmrl_algo.tuning.space import searched
 from tcmrl_data import TrainingError
 
 
@@ -19,22 +21,22 @@ def tuned_settings(
         folder: of tunings, each in `ENV-ALGO`, where `tcmrl tune` puts it.
         environments: those that are wanted; all where empty.
         only: labels of the methods that must be tuned; all where empty. Of others, those that exist are read.
+            A method of which the experiment itself sets all that is searched need not be tuned.
 
     Raises:
         TrainingError: a method was not tuned, no trial of it ended well, or methods of an environment were
             tuned with unequal effort.
     """
-    methods = experiment.methods.items()
-    wanted = {method.algorithm for label, method in methods if not only or label in only}
     found = {
         environment: {
             algorithm: _tuned(place, algorithm)
-            for algorithm in sorted({method.algorithm for _, method in methods})
+            for algorithm in sorted({method.algorithm for method in experiment.methods.values()})
             for place in [Path(folder) / f"{choice.tuning or environment}-{algorithm}"]
             if algorithm in wanted or (place / RECORD).is_file()
         }
         for environment, choice in experiment.environments.items()
         if not environments or environment in environments
+        for wanted in [_open_to_search(experiment, environment, only)]
     }
     for environment, settings in found.items():
         efforts = [(name, (one.trials, one.steps, one.seeds, one.root)) for name, one in settings.items()]
@@ -46,6 +48,16 @@ def tuned_settings(
                     f"{_effort(settings[name])}; tune methods with equal effort to compare them"
                 )
     return found
+
+
+def _open_to_search(experiment: Experiment, environment: str, only: Sequence[str]) -> set[str]:
+    """The algorithms of methods of whose search the experiment leaves something open."""
+    return {
+        method.algorithm
+        for label, method in experiment.methods.items()
+        if not only or label in only
+        if searched(METHODS.get(method.algorithm).search, experiment.overrides(environment, label))
+    }
 
 
 def _tuned(folder: Path, algorithm: str) -> Tuned:
