@@ -231,23 +231,6 @@ def test_the_loss_is_the_weighed_sum_and_reaches_every_network() -> None:
     assert min(gradients(made, found.total, parts).values()) > 0
 
 
-def test_the_actor_critic_learns_from_no_more_steps_of_a_task_than_asked() -> None:
-    given, capped, free = batch(), learner(policy_steps=7), learner()
-    everything = losses_of(free, given, step=5)
-    found = losses_of(capped, given, step=5)
-    assert found.steps is not None and everything.steps is not None
-    kept, real = found.steps.mask.flatten(1), everything.steps.mask.flatten(1)
-    assert real.sum(dim=1).min() > 7
-    assert kept.sum(dim=1).tolist() == [7] * len(kept) and not (kept & ~real).any()
-    assert torch.equal(found.steps.rewards, everything.steps.rewards)
-    assert found.context is not None and everything.context is not None
-    assert torch.equal(found.context, everything.context)
-    other = losses_of(capped, given, step=6).steps
-    assert other is not None and (other.mask.flatten(1) != kept).any()
-    enough = losses_of(learner(policy_steps=int(real.sum(dim=1).max())), given, step=5).steps
-    assert enough is not None and torch.equal(enough.mask.flatten(1), real)
-
-
 def test_states_are_relabelled_by_the_belief_before_and_the_next_ones_by_the_belief_after_a_step() -> None:
     made = learner()
     found = losses_of(made, batch(), step=5)
@@ -290,19 +273,7 @@ def test_batches_hold_whole_lanes(contexts: tuple[int, ...], expected: int) -> N
     shared = shared.model_copy(
         update={"batch": shared.batch.model_copy(update={"context_trajectories": contexts})}
     )
-    method = Borel()
-    assert method.batch_request(shared, BorelConfig()).kinds == {"episodes": Trajectories(expected)}
-    belief, policy = method.stages(shared, BorelConfig(policy_lanes=5, episodes_per_belief=2))
-    assert belief.request.kinds == {"episodes": Trajectories(expected)}
-    assert policy.request.kinds == {"episodes": Trajectories(10)}
-    assert method.stages(shared, BorelConfig())[1].request == belief.request
-
-
-def test_the_steps_that_the_actor_critic_learns_from_are_of_all_lanes() -> None:
-    made, given = learner(policy_steps=12), steps(3, 8, 6, seed=7, lengths=(6, 4, 5))
-    found = losses_of(made, Batch(torch.tensor([0, 1, 2]), {"episodes": given}), step=5).steps
-    assert found is not None and found.mask.shape == (3, 4, 12)
-    assert found.mask.sum(dim=(1, 2)).tolist() == [12] * 3 and found.mask.any(dim=2).all()
+    assert Borel().batch_request(shared, BorelConfig()).kinds == {"episodes": Trajectories(expected)}
 
 
 def test_dense_rewards_are_refused() -> None:

@@ -26,10 +26,6 @@ class BorelConfig(MethodConfig):
         episodes_per_belief: episodes of a task that are filtered one after the other (published code: 2).
         explore: who collects the first episodes: the `policy`, whose belief starts from the prior, and later
             from that after the first episode (published code), or `uniform` actions (ours).
-        policy_lanes: lanes of a task whose beliefs one step of the policy's stage filters; as many as in the
-            belief's stage where unset (published code: the beliefs of all data, once before the stage).
-        policy_steps: most steps of a task that the actor-critic learns from at once, drawn from its lanes
-            (published code: 256); all of them where unset.
         vae_share: share of all steps that train the belief; the others train the policy (ours).
     """
 
@@ -45,6 +41,4 @@ class BorelConfig(MethodConfig):
     reconstruction: Literal["mean", "sum"] = "mean"
     episodes_per_belief: int = Field(default=2, ge=2)
     explore: Literal["policy", "uniform"] = "policy"
-    policy_lanes: int | None = Field(default=None, ge=1)
-    policy_steps: int | None = Field(default=None, ge=1)
     vae_share: float = Field(default=0.25, gt=0, lt=1)
