@@ -134,6 +134,7 @@ def check_chain(held: list[Dataset], folder: Path, steps: list[tuple[str, int, i
     shutil.rmtree(folder)
 
 
+@pytest.mark.sweep
 @settings(max_examples=25)
 @given(steps=chains_of(OPERATIONS))
 def test_chains_keep_parts_and_splits(

@@ -203,6 +203,7 @@ def test_a_killed_extension_goes_on(tiny_copy: CopyTiny) -> None:
     assert verify_dataset(folder).findings == ()
 
 
+@pytest.mark.sweep
 def test_repair_makes_extended_parts_and_their_sources_again(tiny_copy: CopyTiny) -> None:
     folder = tiny_copy()
     extend_dataset(folder, episodes=3, tasks=[0], noise=0.1, workers=1)

@@ -105,6 +105,7 @@ def test_numbers_without_a_mark_are_found() -> None:
     assert unmarked_numbers(text) == ["-1.5", "4.5", "1,234.5"]
 
 
+@pytest.mark.sweep
 def test_the_documentation_says_what_its_results_give() -> None:
     different = [
         str(file) for file, text in recompute.recomputed(recompute.ROOT) if file.read_text("utf-8") != text

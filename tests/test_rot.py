@@ -97,6 +97,7 @@ def test_rot_is_named_and_repaired(
     assert cases == rounds * 18
 
 
+@pytest.mark.sweep
 def test_a_dataset_all_of_whose_parts_rotted_is_made_again(sound: Path, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(sound, folder)

@@ -94,6 +94,7 @@ print(*report.findings, *(replay.exact for replay in report.replays))
 """
 
 
+@pytest.mark.sweep
 def test_a_half_built_dataset_is_completed_on_another_platform(half_built: Path) -> None:
     made_here = {step: (half_built / part_file(PartKey(0, step))).read_bytes() for step in (0, 100)}
     elsewhere("build", *RECIPE, "--tasks", "0", "--workers", "1", "--out", half_built)
