@@ -171,6 +171,14 @@ def tiny_folder(
 
 
 @pytest.fixture(scope="session")
+def small_results(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
+    """The results folder of the small experiment of `tests/experiments.py`, with all its runs."""
+    from tests.experiments import run_small
+
+    return made_once("small-results", lambda folder: run_small(tiny_folder, folder), tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
 def tiny(tiny_folder: Path) -> Dataset:
     return tcmrl_data.open_dataset(tiny_folder)
 
