@@ -25,7 +25,7 @@ from tests.adapters import oracle
 from tests.commands import Call, assert_refused, in_process
 from tests.environments import environment_of
 from tests.plugin_packages import install
-from tests.terminal import assert_fits, in_terminal
+from tests.terminal import as_in_terminal, assert_fits
 
 SMALL = ("batch.transitions=8", "actor_critic.hidden=[8]", "tcmrl.latent=4", "run.episodes=3")
 
@@ -251,7 +251,7 @@ def test_evaluate_command_compares_all_protocols(trained: Path, call: Call) -> N
 
 
 def test_evaluations_by_every_protocol_fit_a_terminal_with_every_number_whole(trained: Path) -> None:
-    shown = in_terminal("tcmrl", "evaluate", trained, "--protocol", "all", "--quiet")
+    shown = as_in_terminal(tcmrl, "evaluate", trained, "--protocol", "all", "--quiet")
     assert shown.code == 0
     assert_fits(shown.output)
     for protocol in PROTOCOLS.names():

@@ -26,7 +26,7 @@ from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
 from tests.directed import EXPERIMENT, Directions
-from tests.terminal import assert_fits, in_terminal
+from tests.terminal import as_in_terminal, assert_fits
 from tests.workers import PATIENCE, command_line, marked_pids, wait_for
 
 CLAIM = {"text": "TCMRL ends higher", "better": "TCMRL", "worse": "no context"}
@@ -89,7 +89,7 @@ def test_tables_by_protocol_fit_a_terminal_with_every_number_whole(
     finished: Path, tiny_folder: Path, tmp_path: Path
 ) -> None:
     file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
-    shown = in_terminal("tcmrl", "experiment", file, "--out", finished)
+    shown = as_in_terminal(tcmrl, "experiment", file, "--out", finished)
     tables = shown.output[: shown.output.index(str(finished))]  # a line of words wraps, nothing is lost
     assert_fits(tables)
     lines = [line.split() for line in tables.splitlines()]
@@ -226,7 +226,7 @@ def test_the_list_of_experiments_says_what_each_asks(call: Call) -> None:
     rows = json.loads(call("experiment", "--list", "--json")[1])["experiments"]
     assert [row["name"] for row in rows] == experiment_names()
     assert all(row["title"] and row["methods"] and row["seeds"] for row in rows)
-    shown = in_terminal("tcmrl", "experiment", "--list")
+    shown = as_in_terminal(tcmrl, "experiment", "--list")
     assert_fits(shown.output)
     assert all(name in shown.output for name in experiment_names())
 
