@@ -99,6 +99,14 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(LocalEngine, "run", InProcessEngine.run)
 
 
+@pytest.fixture(scope="module")
+def module_in_process() -> Iterator[None]:
+    """`in_process` for a whole module, its fixtures included."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LocalEngine, "run", InProcessEngine.run)
+        yield
+
+
 @pytest.fixture(scope="session")
 def mark() -> Iterator[str]:
     """A mark in the environment of every process that this session starts."""
