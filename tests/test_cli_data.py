@@ -12,6 +12,8 @@ from tcmrl_data.store.manifest import MANIFEST, seal
 from tests.commands import Call, assert_refused, in_process
 from tests.conftest import TASKS, TINY
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 Copy = Callable[[], Path]
 SETTINGS = [argument for text in TINY for argument in ("--set", text)]
 

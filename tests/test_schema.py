@@ -19,6 +19,8 @@ from tcmrl_data.store.part_record import RECORD
 from tests.commands import in_process
 from tests.workers import ROOT
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 Copy = Callable[[], Path]
 PUBLISHED = ROOT / "docs" / "schema"
 

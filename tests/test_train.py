@@ -43,7 +43,8 @@ def test_one_seed_gives_the_same_parameters_after_40_steps(start: Train, algorit
     torch.manual_seed(12345)  # the global state has no influence
     second = start("second", algorithm=algorithm, steps=40, seed=3)
     assert first.digest == second.digest
-    assert start("third", algorithm=algorithm, steps=40, seed=4).digest != first.digest
+    digests = {start(f"seed {seed}", algorithm=algorithm, steps=1, seed=seed).digest for seed in (3, 4)}
+    assert len(digests) == 2
 
 
 def test_precision_reaches_training_and_keeps_it_repeatable(start: Train) -> None:
