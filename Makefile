@@ -1,6 +1,7 @@
 # make demo   the whole main job on a small environment, from nothing
-# make test   the tests, but for the sweeps that take minutes
-# make check  what continuous integration runs
+# make test   the tests that a change should pass at once
+# make check  what continuous integration runs: linters, types, and all tests but the sweeps
+# make sweeps what takes hours: every kill, every fault, a million parts; before a release
 # make docs   the documentation as a site, in build/docs
 PYTHON ?= python3
 SEED ?= 0
@@ -21,7 +22,7 @@ export MPLBACKEND ?= Agg
 # Hundreds of processes would compile the packages again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check format docs docs-links clean
+.PHONY: demo test check sweeps format docs docs-links clean
 
 $(BIN)/python:
 	@$(PYTHON) -c "import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), 'Python 3.11 to 3.13 needed: make PYTHON=python3.11'"
@@ -49,14 +50,18 @@ demo: $(INSTALLED)
 	@echo "Next: $(BIN)/tcmrl experiment tour --data $(DATA)"
 
 test: $(INSTALLED_TEST)
-	$(BIN)/python -m pytest $(SPREAD) -m "not sweep"
+	$(BIN)/python -m pytest $(SPREAD) -m "not check and not sweep"
 
 check: $(INSTALLED_TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest $(SPREAD)
+	$(BIN)/python -m pytest $(SPREAD) -m "not sweep"
+
+sweeps: $(INSTALLED_TEST)
+	$(BIN)/python -m pytest $(SPREAD) --sweep 1 -m sweep
+	$(BIN)/python -m tests.kill_sweep --kills 200
 
 format: $(INSTALLED_TEST)
 	$(BIN)/ruff check --fix .
