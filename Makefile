@@ -2,6 +2,7 @@
 # make test   the tests, but for the sweeps that take minutes
 # make check  what continuous integration runs
 # make docs   the documentation as a site, in build/docs
+# make results   results/README.md from the tables beside it
 PYTHON ?= python3
 SEED ?= 0
 JOBS ?= 2
@@ -21,7 +22,7 @@ export MPLBACKEND ?= Agg
 # Hundreds of processes would compile the packages again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check format docs docs-links clean
+.PHONY: demo test check format docs docs-links results clean
 
 $(BIN)/python:
 	@$(PYTHON) -c "import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), 'Python 3.11 to 3.13 needed: make PYTHON=python3.11'"
@@ -69,6 +70,9 @@ docs: $(INSTALLED_DOCS)
 
 docs-links: $(INSTALLED_DOCS)
 	$(SPHINX) --builder linkcheck docs build/docs-links
+
+results: $(INSTALLED)
+	$(BIN)/tcmrl report results/runs.csv
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

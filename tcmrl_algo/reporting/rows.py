@@ -16,8 +16,8 @@ from tcmrl_algo.reporting.returns import DatasetReturns
 from tcmrl_algo.settings.run import LOGGING_KEYS
 from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_algo.training.config import stage_plan
-from tcmrl_algo.tuning.record import RECORD, read_tuning
-from tcmrl_algo.tuning.table import TUNING, TrialRow, trial_rows
+from tcmrl_algo.tuning.record import read_tuning
+from tcmrl_algo.tuning.table import TrialRow, trial_rows
 from tcmrl_data import CheckpointError, Worth
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.records import read_record
@@ -196,22 +196,25 @@ def add_rows(file: Path, measured: Iterable[Measured]) -> list[RunRow]:
 
 
 def add_tunings(file: Path, folders: Sequence[Path]) -> list[TrialRow]:
-    """Puts the trials of folders of `tcmrl tune` into a table; the rows of these."""
+    """Puts the trials of folders of `tcmrl tune` into a table, `tuning.csv`; the rows of these.
+
+    Raises:
+        CheckpointError: a folder holds no tuning, or `file` is no such table.
+    """
     rows = [row for folder in folders for row in trial_rows(folder.resolve().name, read_tuning(folder))]
     _update(TrialRow, file, rows, lambda row: (row.tuning, f"{row.trial:06}"))
     return rows
 
 
 def add_worth(file: Path, documents: Sequence[Path]) -> list[WorthRow]:
-    """Puts documents of `inspect worth --json` into a table; the rows of these."""
+    """Puts documents of `inspect worth --json` into a table, `worth.csv`; the rows of these.
+
+    Raises:
+        CheckpointError: a document is none, or `file` is no such table.
+    """
     rows = [row for document in documents for row in worth_rows(document.stem, read_record(Worth, document))]
     _update(WorthRow, file, rows, lambda row: (row.dataset, row.split))
     return rows
-
-
-def is_tuning(path: Path) -> bool:
-    """Whether a folder is one of `tcmrl tune`."""
-    return (path / RECORD).is_file()
 
 
 def run_rows(experiment: str, result: RunResult, stored: DatasetReturns | None) -> list[RunRow]:
