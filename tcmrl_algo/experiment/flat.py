@@ -3,8 +3,7 @@
 import csv
 import dataclasses
 import io
-from collections.abc import Callable, Iterable, Mapping
-from functools import cache
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_type_hints
@@ -27,14 +26,13 @@ def read_table(kind: type[Row], file: Path) -> list[Row]:
         text = file.read_text(encoding="utf-8")
     except OSError as error:
         raise CheckpointError(f"{file}: {error.strerror}") from None
-    reader = csv.DictReader(io.StringIO(text))
-    columns = list(_parsers(kind))
-    if reader.fieldnames != columns:
-        raise CheckpointError(f"{file} has columns {reader.fieldnames}; they must be {columns}")
+    reader, parsers = csv.DictReader(io.StringIO(text)), _parsers(kind)
+    if reader.fieldnames != list(parsers):
+        raise CheckpointError(f"{file} has columns {reader.fieldnames}; they must be {list(parsers)}")
     rows = []
     for values in reader:
         try:
-            rows.append(_row(kind, values))
+            rows.append(kind(**{column: parse(values[column]) for column, parse in parsers.items()}))
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(f"{file}, line {reader.line_num}: {error}") from None
     return rows
@@ -44,9 +42,10 @@ def write_table(kind: type[Row], file: Path, rows: Iterable[Row]) -> None:
     """Writes dataclasses as a CSV file, floats with six significant digits."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow(_parsers(kind))
+    columns = list(_parsers(kind))
+    writer.writerow(columns)
     for row in rows:
-        writer.writerow([_cell(getattr(row, column)) for column in _parsers(kind)])
+        writer.writerow([_cell(getattr(row, column)) for column in columns])
     replace_file(file, stream.getvalue().encode())
 
 
@@ -56,11 +55,6 @@ def merged(old: Iterable[Row], new: Iterable[Row], key: Callable[[Row], Any]) ->
     return [rows[place] for place in sorted(rows, key=str)]
 
 
-def _row(kind: type[Row], values: Mapping[str, str]) -> Row:
-    return kind(**{column: parse(values[column]) for column, parse in _parsers(kind).items()})
-
-
-@cache
 def _parsers(kind: type[Any]) -> dict[str, Callable[[str], Any]]:
     hints = get_type_hints(kind)
     return {field.name: _parser(hints[field.name]) for field in dataclasses.fields(kind)}

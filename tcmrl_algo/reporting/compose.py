@@ -23,8 +23,8 @@ With folds, every task of the dataset is a test task once, and the interval is o
 fold: it covers training on these splits, not tasks beyond the dataset. `other context` is the return of the \
 same policy with the contexts of other tasks; the regret is the oracle's return minus the policy's; `best \
 fixed` is the return of the best policy that acts the same in all tasks, fitted on the training tasks; the \
-normalized score is 0 for uniform actions and 1 for the oracle or, without one, for the best behavior policy. \
-A `(privileged)` method is a control that observes the task parameters."""
+normalized score is 0 for uniform actions and 1 for the oracle or, without one, for the best behavior \
+policy. A `(privileged)` method is a control that observes the task parameters."""
 CLAIMS = """\
 Differences are taken run by run (same seed, same fold), and positive differences support the claim, which \
 is judged under every protocol that it concerns. The 95% interval of the mean difference is by Student's t, \

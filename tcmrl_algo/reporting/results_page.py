@@ -6,6 +6,7 @@ experiment and environment. `Numbers` are the names that a template may use.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -76,12 +77,9 @@ class Numbers:
             TrainingError: there are none.
         """
         place = (experiment, environment, method, protocol)
-        found = [
-            row for row in self.rows if (row.experiment, row.environment, row.method, row.protocol) == place
-        ]
-        if not found:
+        if place not in self._by_place:
             raise TrainingError(f"the table of runs holds none of {', '.join(place)}")
-        return found
+        return self._by_place[place]
 
     def values(
         self, experiment: str, environment: str, method: str, protocol: str, column: str = "final"
@@ -91,8 +89,9 @@ class Numbers:
         Raises:
             TrainingError: there are no rows, no such column, or an empty cell in it.
         """
-        found = [getattr(row, column, None) for row in self.runs(experiment, environment, method, protocol)]
-        if None in found:
+        rows = self.runs(experiment, environment, method, protocol)
+        found = [value for row in rows if (value := getattr(row, column, None)) is not None]
+        if len(found) < len(rows):
             raise TrainingError(f"{experiment}, {environment}, {method}, {protocol} lacks {column!r}")
         return found
 
@@ -106,7 +105,9 @@ class Numbers:
         self, experiment: str, environment: str, method: str, protocol: str, column: str = "final"
     ) -> str:
         """The 95% interval of this mean by Student's t, as text."""
-        low, high = mean_interval(self.values(experiment, environment, method, protocol, column), fewest=2) or (
+        low, high = mean_interval(
+            self.values(experiment, environment, method, protocol, column), fewest=2
+        ) or (
             None,
             None,
         )
@@ -129,7 +130,9 @@ class Numbers:
         Raises:
             TrainingError: no two runs share them.
         """
-        left = {row.pair: getattr(row, column) for row in self.runs(experiment, environment, method, protocol)}
+        left = {
+            row.pair: getattr(row, column) for row in self.runs(experiment, environment, method, protocol)
+        }
         right = {
             row.pair: getattr(row, other_column or column)
             for row in self.runs(other_experiment or experiment, environment, other, protocol)
@@ -188,9 +191,10 @@ class Numbers:
         """The rows of an experiment by method; privileged ones last."""
         found: dict[str, list[RunRow]] = {}
         for row in self.rows:
-            if (row.experiment, row.environment) == (experiment, environment):
-                if not algorithm or row.algorithm == algorithm:
-                    found.setdefault(row.method, []).append(row)
+            if (row.experiment, row.environment) == (experiment, environment) and (
+                not algorithm or row.algorithm == algorithm
+            ):
+                found.setdefault(row.method, []).append(row)
         return dict(sorted(found.items(), key=lambda entry: entry[1][0].privileged))
 
     def board(
@@ -202,7 +206,7 @@ class Numbers:
             experiment: its name.
             environment: name of the environment.
             protocols: columns; all where empty. Methods are sorted by the first.
-            compared: a method whose returns minus each other method's have a column, under the first protocol.
+            compared: a method whose returns minus each other method's have a column, by the first protocol.
 
         Raises:
             TrainingError: no rows, or methods with different data: a comparison never crosses datasets.
@@ -223,9 +227,7 @@ class Numbers:
             [f"*{label}*", "", number(fmean(known)), *[""] * (len(head) - 3)]
             for label, known in _references(everything).items()
         ]
-        ranked = sorted(
-            methods, key=lambda name: -self.mean(experiment, environment, name, first)
-        )
+        ranked = sorted(methods, key=lambda name: -self.mean(experiment, environment, name, first))
         against = self._against(experiment, environment, first, compared, ranked)
         for name in ranked:
             place = (experiment, environment, name)
@@ -244,10 +246,18 @@ class Numbers:
             lines.append([*cells, number(fmean(speeds)) if speeds else ""])
         return "\n".join(f"| {' | '.join(line)} |" for line in (head, ["---"] * len(head), *lines))
 
+    @cached_property
+    def _by_place(self) -> dict[tuple[str, str, str, str], list[RunRow]]:
+        found: dict[tuple[str, str, str, str], list[RunRow]] = {}
+        for row in self.rows:
+            place = (row.experiment, row.environment, row.method, row.protocol)
+            found.setdefault(place, []).append(row)
+        return found
+
     def _against(
         self, experiment: str, environment: str, protocol: str, compared: str, methods: Sequence[str]
     ) -> dict[str, list[str]]:
-        """Cells of what a method has over each other, and p values after Holm's correction for all of them."""
+        """Cells of a method's returns minus the others', and p values after Holm's correction for them."""
         others = [name for name in methods if compared and name != compared]
         found = [self.difference(experiment, environment, protocol, compared, name) for name in others]
         known = [one.probability for one in found if one.probability is not None]
@@ -307,7 +317,7 @@ def page_of(file: Path, numbers: Numbers) -> str:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([file.parent, Path(__file__).parent]),
         undefined=jinja2.StrictUndefined,
-        autoescape=False,  # noqa: S701 (Markdown of our own tables)
+        autoescape=False,  # the page is Markdown
         finalize=_shown,
         trim_blocks=True,
         lstrip_blocks=True,

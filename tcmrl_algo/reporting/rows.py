@@ -1,4 +1,4 @@
-"""Results of single runs as rows of a table: `runs.csv`, and beside it `curves.csv`, `tuning.csv`, `worth.csv`.
+"""Results as rows of tables: `runs.csv`, and beside it `curves.csv`, `tuning.csv` and `worth.csv`.
 
 The table outlives results folders: a row holds what comparisons need, and names data, settings and code.
 """
@@ -10,7 +10,7 @@ from typing import Any
 
 from tcmrl_algo.experiment.compact import compact
 from tcmrl_algo.experiment.flat import Row, merged, read_table, write_table
-from tcmrl_algo.experiment.results import RunResult, success_rate
+from tcmrl_algo.experiment.results import ContextMeasures, RunResult, success_rate
 from tcmrl_algo.reporting.measuring import Measured
 from tcmrl_algo.reporting.returns import DatasetReturns
 from tcmrl_algo.settings.run import LOGGING_KEYS
@@ -150,7 +150,7 @@ class WorthRow:
     tasks: int
     own: float
     single: float
-    uniform: float
+    uniform: float | None
     best: float
     worth: float | None
     low: float | None
@@ -184,7 +184,9 @@ def add_rows(file: Path, measured: Iterable[Measured]) -> list[RunRow]:
         source = found.source
         folder = source.runs[0].folder.parents[1]
         if not (folder / "experiment.json").is_file():
-            raise CheckpointError("single runs have no experiment; only results folders can be added to a table")
+            raise CheckpointError(
+                "single runs have no experiment; only results folders can be added to a table"
+            )
         for run in source.runs:
             result = run.result
             rows += run_rows(folder.resolve().name, result, source.datasets.get(result.environment))
@@ -227,37 +229,44 @@ def run_rows(experiment: str, result: RunResult, stored: DatasetReturns | None) 
     """
     result = compact(result)
     known = stored if stored is not None and stored.root == result.root else None
-    settings, contexts = result.config.settings, result.contexts
-    shared: dict[str, Any] = {
-        name: getattr(result, name)
-        for name in (
-            *("environment", "profile", "method", "algorithm", "privileged", "seed", "fold", "steps"),
-            "behavior_seed",
-        )
-    }
-    shared |= {
-        name: None if contexts is None else getattr(contexts, name)
-        for name in ("context_ratio", "centroid_accuracy", "attention_zero", "attention_nonzero")
-    }
+    settings, tuned = result.config.settings, result.tuned
+    contexts = result.contexts or ContextMeasures(tasks=0)
     other = settings.run.context_snapshots
-    tuned = result.tuned
     seconds, memory = result.training_seconds, result.peak_memory
     return [
         RunRow(
-            **shared,
             experiment=experiment,
+            environment=result.environment,
             dataset_profile=None if known is None else known.profile,
+            behavior_seed=result.behavior_seed,
             root=result.root[:HEX_DIGITS],
+            profile=result.profile,
+            method=result.method,
+            algorithm=result.algorithm,
+            privileged=result.privileged,
             actor_critic=actor_critic(settings, result.algorithm),
             snapshots=str(settings.run.snapshots),
             context_snapshots=None if other in (None, settings.run.snapshots) else str(other),
             tuned=None if tuned is None else f"{tuned.trials} x {tuned.steps} on {tuned.environment}",
+            seed=result.seed,
+            fold=result.fold,
             protocol=protocol,
             test_tasks=len(evaluation["tasks"]),
-            **{name: evaluation.get(f"mean_{name}") for name in ("final", "shuffled", "regret", "normalized")},
+            final=evaluation["mean_final"],
+            shuffled=evaluation["mean_shuffled"],
+            regret=evaluation["mean_regret"],
+            normalized=evaluation["mean_normalized"],
             success=success_rate(evaluation),
-            **{name: _mean(evaluation["tasks"], name) for name in ("random", "oracle", "behavior", "fixed")},
+            random=_mean(evaluation["tasks"], "random"),
+            oracle=_mean(evaluation["tasks"], "oracle"),
+            behavior=_mean(evaluation["tasks"], "behavior"),
+            fixed=_mean(evaluation["tasks"], "fixed"),
             stored=None if known is None or result.fold is not None else known.test_return,
+            context_ratio=contexts.context_ratio,
+            centroid_accuracy=contexts.centroid_accuracy,
+            attention_zero=contexts.attention_zero,
+            attention_nonzero=contexts.attention_nonzero,
+            steps=result.steps,
             policy_steps=tuple(stage_plan(result.config))[-1].steps,
             ms_per_step=None if seconds is None else 1e3 * seconds / result.steps,
             peak_mb=None if memory is None else memory / 1e6,
@@ -272,7 +281,14 @@ def run_rows(experiment: str, result: RunResult, stored: DatasetReturns | None) 
 
 def curve_rows(experiment: str, result: RunResult, protocol: str) -> list[CurveRow]:
     """The points of a learning curve; none of one that has its end alone."""
-    where = (experiment, result.environment, result.root[:HEX_DIGITS], result.method, result.seed, result.fold)
+    where = (
+        experiment,
+        result.environment,
+        result.root[:HEX_DIGITS],
+        result.method,
+        result.seed,
+        result.fold,
+    )
     points = result.curve if len(result.curve) > 1 else ()
     return [CurveRow(*where, protocol, point.step, point.final, point.shuffled) for point in points]
 
@@ -282,21 +298,27 @@ def worth_rows(dataset: str, worth: Worth) -> list[WorthRow]:
     rows = []
     for split in worth.splits:
         stages = [stage for stage in worth.stages if stage.split == split.split]
-        ends = {
-            f"{name}_{end}": getattr(stages[place], name) if stages else None
-            for name in ("rewarded", "reward", "dynamics")
-            for end, place in (("first", 0), ("last", -1))
-        }
+        first, last = (stages[0], stages[-1]) if stages else (None, None)
         rows.append(
             WorthRow(
                 dataset=dataset,
                 environment=worth.environment,
                 root=worth.root[:HEX_DIGITS],
-                **{
-                    name: getattr(split, name)
-                    for name in ("split", "tasks", "own", "single", "uniform", "best", "worth", "low", "high")
-                },
-                **ends,
+                split=split.split,
+                tasks=split.tasks,
+                own=split.own,
+                single=split.single,
+                uniform=split.uniform,
+                best=split.best,
+                worth=split.worth,
+                low=split.low,
+                high=split.high,
+                rewarded_first=first.rewarded if first else None,
+                rewarded_last=last.rewarded if last else None,
+                reward_first=first.reward if first else None,
+                reward_last=last.reward if last else None,
+                dynamics_first=first.dynamics if first else None,
+                dynamics_last=last.dynamics if last else None,
             )
         )
     return rows
@@ -320,7 +342,8 @@ def settings_digest(result: RunResult) -> str:
 
 def _mean(tasks: Sequence[dict[str, Any]], name: str) -> float | None:
     values = [task.get(name) for task in tasks]
-    return None if not values or None in values else sum(values) / len(values)
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None
 
 
 def _update(kind: type[Row], file: Path, rows: Iterable[Row], key: Callable[[Row], Any]) -> None:
@@ -328,7 +351,15 @@ def _update(kind: type[Row], file: Path, rows: Iterable[Row], key: Callable[[Row
 
 
 def _run_key(row: RunRow) -> tuple[str, ...]:
-    return row.experiment, row.environment, row.root, row.method, f"{row.seed:06}", str(row.fold), row.protocol
+    return (
+        row.experiment,
+        row.environment,
+        row.root,
+        row.method,
+        f"{row.seed:06}",
+        str(row.fold),
+        row.protocol,
+    )
 
 
 def _curve_key(row: CurveRow) -> tuple[str, ...]:

@@ -75,13 +75,13 @@ def read_trials(place: Path) -> dict[str, list[TrialRow]]:
     Raises:
         CheckpointError: the table is not one, or a record is damaged.
     """
-    if place.is_dir():
-        folders = sorted(file.parent for file in place.glob(f"*/{RECORD}"))
-        return {folder.name: trial_rows(folder.name, read_tuning(folder)) for folder in folders}
     found: dict[str, list[TrialRow]] = {}
-    for row in read_table(TrialRow, place):
-        found.setdefault(row.tuning, []).append(row)
-    return found
+    if place.is_file():
+        for row in read_table(TrialRow, place):
+            found.setdefault(row.tuning, []).append(row)
+        return found
+    folders = sorted(file.parent for file in place.glob(f"*/{RECORD}"))
+    return {folder.name: trial_rows(folder.name, read_tuning(folder)) for folder in folders}
 
 
 def best_settings(trials: Sequence[TrialRow]) -> Tuned | None:

@@ -24,7 +24,7 @@ def tuned_settings(
             A method of which the experiment itself sets all that is searched need not be tuned.
 
     Raises:
-        CheckpointError: `place` is neither.
+        CheckpointError: a record or the table is damaged.
         TrainingError: a method was not tuned, no trial of it ended well, or methods of an environment were
             tuned with unequal effort.
     """
@@ -62,13 +62,12 @@ def _open_to_search(experiment: Experiment, environment: str, only: Sequence[str
     }
 
 
-def _tuned(
-    trials: Mapping[str, Sequence[TrialRow]], name: str, place: str | Path, algorithm: str
-) -> Tuned:
+def _tuned(trials: Mapping[str, Sequence[TrialRow]], name: str, place: str | Path, algorithm: str) -> Tuned:
     if name not in trials:
-        folder = place if Path(place).is_dir() else "tuning"
+        folder = "tuning" if Path(place).is_file() else place
         raise TrainingError(
-            f"{place}: {name} holds no tuning; `tcmrl tune --algo {algorithm} --out {folder}/{name}` makes one"
+            f"{place}: {name} holds no tuning; `tcmrl tune --algo {algorithm} --out {folder}/{name}` "
+            "makes one"
         )
     found = best_settings(trials[name])
     if found is None:
