@@ -108,7 +108,7 @@ def test_a_report_of_results(browser: Chromium, tmp_path: Path) -> None:
     file = tmp_path / "report.html"
     file.write_text(page_html(page), encoding="utf-8")
     browser.open(file)
-    assert browser.evaluate("document.images.length") == len(page.figures) >= 3
+    assert browser.evaluate("document.images.length") == len(page.figures) >= 2
     assert browser.evaluate("Array.from(document.images).every(image => image.naturalWidth > 0)")
     assert_quiet(browser)
 
