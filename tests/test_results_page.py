@@ -195,7 +195,6 @@ def test_the_command_adds_runs_replaces_them_and_writes_the_page(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     call, table = in_process(tcmrl, capsys), tmp_path / "boards" / RUNS
-    table.parent.mkdir()
     first, second = _experiment(tmp_path / "first", 1.0, 2.0), _experiment(tmp_path / "second", 5.0, 6.0)
     for folder in (first, second, first):
         code, output, errors = call("report", folder, "--rows", table, "--quiet")

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 from tcmrl_algo.experiment.compact import DIGITS
 from tcmrl_data import CheckpointError
-from tcmrl_data.foundation.disk import replace_file
+from tcmrl_data.foundation.disk import make_folders, replace_file
 
 YES = "yes"
 Row = TypeVar("Row")
@@ -46,6 +46,7 @@ def write_table(kind: type[Row], file: Path, rows: Iterable[Row]) -> None:
     writer.writerow(columns)
     for row in rows:
         writer.writerow([_cell(getattr(row, column)) for column in columns])
+    make_folders(file.parent)
     replace_file(file, stream.getvalue().encode())
 
 

@@ -19,7 +19,7 @@ from tcmrl_algo.reporting.figures import draw_board, draw_method_curves
 from tcmrl_algo.reporting.rows import CURVES, WORTH, CurveRow, RunRow, WorthRow
 from tcmrl_algo.tuning.table import TUNING, TrialRow
 from tcmrl_data import TrainingError
-from tcmrl_data.foundation.disk import replace_file
+from tcmrl_data.foundation.disk import make_folders, replace_file
 
 PAGE = "README.md"
 TEMPLATE = f"{PAGE}.jinja"
@@ -345,7 +345,7 @@ def write_results_page(file: str | Path, out: str | Path | None = None) -> list[
     folder = file.parent if out is None else Path(out)
     numbers = read_numbers(file)
     text = page_of(file, numbers)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folders(folder)
     replace_file(folder / PAGE, text.encode())
     for name, draw in numbers.pictures.items():
         draw(folder / name)
