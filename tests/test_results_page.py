@@ -174,6 +174,18 @@ def test_a_board_sorts_methods_below_what_they_are_compared_with() -> None:
     assert lines[6].startswith("| blind | 5 | 0.000 (0.000 to 0.000) |  | 3.00 (1.04 to 4.96) | 0.013 |")
 
 
+def test_a_gain_is_a_share_of_the_range_over_the_blind_learner() -> None:
+    """From -10 to 0, of a range from -20 to 0; the known task does not count."""
+    blind = _rows("blind", -12.0, -8.0, algorithm="no_context")
+    others = (_rows("A", 1.0, -1.0), _rows("B", -8.0, -4.0), _rows("known", 9.0, 9.0, privileged=True))
+    assert _numbers(blind, *others).gained("small", "point-robot", "offline") == ("A", 0.5)
+    without_oracle = [replace(row, oracle=None, behavior=20.0) for row in (*blind, *others[1])]
+    assert _numbers(without_oracle).gained("small", "point-robot", "offline") == ("B", 0.1)
+    for rows in (others, (blind,), ([replace(row, random=None) for row in blind], *others)):
+        with pytest.raises(TrainingError, match="not known"):
+            _numbers(*rows).gained("small", "point-robot", "offline")
+
+
 @pytest.mark.parametrize(
     ("value", "text"),
     [(-4.5687, "-4.57"), (12.61, "12.6"), (-302.4, "-302"), (3747.2, "3,747"), (0.06, "0.060")],

@@ -171,7 +171,11 @@ class Numbers:
     def gained(self, experiment: str, environment: str, protocol: str) -> tuple[str, float]:
         """The best method with a context, and what it gains over the blind one, as a share of the range.
 
-        The range is from uniform actions to the oracle or, without one, to the best behavior policy.
+        The range is from uniform actions to the oracle or, without one, to the best behavior policy. Methods
+        that observe task parameters do not count.
+
+        Raises:
+            TrainingError: no blind method, none with a context, or a range that is not known.
         """
         finals = {
             method: self.mean(experiment, environment, method, protocol)
@@ -179,13 +183,15 @@ class Numbers:
             if not runs[0].privileged and any(row.protocol == protocol for row in runs)
         }
         blind = self.methods(experiment, environment, algorithm=BLIND)
-        (label,) = blind
-        first = blind[label][0]
-        best = first.behavior if first.oracle is None else first.oracle
-        assert best is not None and first.random is not None
-        without = finals.pop(label)
+        label, rows = next(iter(blind.items()), ("", []))
+        without = finals.pop(label, None)
+        best = None if not rows else rows[0].behavior if rows[0].oracle is None else rows[0].oracle
+        if without is None or not finals or best is None or rows[0].random is None:
+            raise TrainingError(
+                f"{experiment}, {environment}, {protocol}: the gain by a context is not known"
+            )
         method = max(finals, key=finals.__getitem__)
-        return method, (finals[method] - without) / (best - first.random)
+        return method, (finals[method] - without) / (best - rows[0].random)
 
     def methods(self, experiment: str, environment: str, *, algorithm: str = "") -> dict[str, list[RunRow]]:
         """The rows of an experiment by method; privileged ones last."""
