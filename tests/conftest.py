@@ -16,6 +16,8 @@ from hypothesis import HealthCheck, settings
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe
+from tcmrl_data.engine.in_process import InProcessEngine
+from tcmrl_data.engine.local import LocalEngine
 from tests.namespace import has_only_loopback
 from tests.workers import MARK, ROOT
 
@@ -97,6 +99,23 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
         yield
 
 
+@pytest.fixture
+def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What starts worker processes on this machine does their work here, without the seconds of a start.
+
+    `tests/test_engines.py` holds that both engines give the same.
+    """
+    monkeypatch.setattr(LocalEngine, "run", InProcessEngine.run)
+
+
+@pytest.fixture(scope="module")
+def module_in_process() -> Iterator[None]:
+    """`in_process` for a whole module, its fixtures included."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(LocalEngine, "run", InProcessEngine.run)
+        yield
+
+
 @pytest.fixture(scope="session")
 def mark() -> Iterator[str]:
     """A mark in the environment of every process that this session starts."""
@@ -124,6 +143,29 @@ def ray_cluster(mark: str) -> Iterator[Any]:
         cluster.shutdown()
 
 
+def made_once(name: str, make: Callable[[Path], object], factory: pytest.TempPathFactory) -> Path:
+    """A folder that one process of the session makes for all of them; nobody may change it.
+
+    Args:
+        name: of the folder, in that of the session.
+        make: fills the folder, which is new.
+        factory: pytest-xdist gives that of each process a folder in the session's.
+    """
+    session = factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        session = session.parent
+    folder = session / name
+    folder.parent.mkdir(exist_ok=True)
+    made = session / f"{folder.name}.made"
+    with (session / f"{folder.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not made.exists():
+            shutil.rmtree(folder, ignore_errors=True)  # of a process that failed
+            make(folder)
+            made.touch()
+    return folder
+
+
 @pytest.fixture(scope="session")
 def tiny_recipe() -> Recipe:
     return tcmrl_data.load_recipe("point-robot", profile="quick", overrides=TINY)
@@ -133,26 +175,24 @@ def tiny_recipe() -> Recipe:
 def tiny_folder(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, tiny_recipe: Recipe
 ) -> Path:
-    """Folder of the tiny dataset: five tasks (one of them test), three snapshots, six episodes each.
-
-    It is built once for all processes of a session; pytest-xdist gives each a folder in the session's.
-    """
+    """Folder of the tiny dataset: five tasks (one of them test), three snapshots, six episodes each."""
     made_before: Path | None = request.config.getoption("--tiny")
     if made_before is not None:
         return made_before
-    session = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        session = session.parent
-    folder = session / "datasets" / "tiny"
-    folder.parent.mkdir(exist_ok=True)
-    with (session / "tiny.lock").open("w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        if not folder.exists():
-            being_made = session / "tiny-being-made"
-            report = tcmrl_data.build_dataset(tiny_recipe, being_made, tasks=TASKS, workers=2)
-            assert (report.failed, report.built) == ((), len(TASKS) * 3)
-            being_made.rename(folder)
-    return folder
+
+    def make(folder: Path) -> None:
+        report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS, engine=InProcessEngine())
+        assert (report.failed, report.built) == ((), len(TASKS) * 3)
+
+    return made_once("datasets/tiny", make, tmp_path_factory)
+
+
+@pytest.fixture(scope="session")
+def small_results(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
+    """The results folder of the small experiment of `tests/experiments.py`, with all its runs."""
+    from tests.experiments import run_small
+
+    return made_once("small-results", lambda folder: run_small(tiny_folder, folder), tmp_path_factory)
 
 
 @pytest.fixture(scope="session")

@@ -22,11 +22,8 @@ from tests.workers import wait_for
 BUILD, EXPERIMENT = "tcmrl_data.build.driver", "tcmrl_algo.experiment.runner"
 """The modules that make units."""
 
-WORK = {
-    BUILD: ("tcmrl_data.build.worker", "_build_parts"),
-    EXPERIMENT: ("tcmrl_algo.experiment.job", "_serve"),
-}
-"""Module and function that do the work of a unit, by the module that makes the unit."""
+WORKERS = {BUILD: "tcmrl_data.build.worker", EXPERIMENT: "tcmrl_algo.experiment.job"}
+"""Module that does the work of a unit, by the module that makes the unit."""
 
 Report = Callable[[Mapping[str, Any]], None]
 
@@ -117,8 +114,7 @@ def _work(spec: dict[str, Any], report: Report) -> str:
             left = max(0, left - 1)
 
     disk.disk = HalfWritten()
-    module, function = WORK[directions.driver]
-    digest: str = getattr(importlib.import_module(module), function)(spec, report_and_obey)
+    digest: str = importlib.import_module(WORKERS[directions.driver]).work(spec, report_and_obey)
     return digest
 
 

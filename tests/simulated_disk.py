@@ -86,7 +86,7 @@ class PreparedParts:
             return [key for key in self.files if key.task in indices]
 
         engine = prepared_engine(out, self.files, keys_of)
-        patch.setattr(build.ENGINES, "get", lambda name: lambda workers, address=None: engine)
+        patch.setattr(build, "make_engine", lambda name, workers, address: engine)
         tasks = self.tasks if tasks is None else tasks
         return tcmrl_data.build_dataset(self.recipe, out, tasks=tasks, workers=1, progress=progress)
 

@@ -1,6 +1,8 @@
-"""Runs commands in a real pseudo-terminal of a given width, and checks that their lines fit."""
+"""Runs commands in terminals of a given width, real or pretended, and checks that their lines fit."""
 
+import contextlib
 import fcntl
+import io
 import os
 import pty
 import re
@@ -12,6 +14,10 @@ import threading
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+import click
+import pytest
+from tcmrl_cli.frame import run
 
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 """Colours, cursor moves and the like."""
@@ -45,6 +51,25 @@ def in_terminal(
     """
     script = Path(sys.executable).with_name(program)
     return _show([str(script), *map(str, arguments)], columns, env or {})
+
+
+def as_in_terminal(command: click.Command, *arguments: object, columns: int = 80) -> Shown:
+    """Like `in_terminal`, in this process: the streams say that they are terminals of so many columns."""
+    output, errors = _PretendedTerminal(), _PretendedTerminal()
+    with (
+        pytest.MonkeyPatch.context() as patch,
+        contextlib.redirect_stdout(output),
+        contextlib.redirect_stderr(errors),
+    ):
+        for name, value in {"TERM": "xterm", "COLUMNS": str(columns), "LINES": "24"}.items():
+            patch.setenv(name, value)
+        code = run(command, [str(argument) for argument in arguments])
+    return Shown(code, *(CONTROL.sub("", stream.getvalue()) for stream in (output, errors)))
+
+
+class _PretendedTerminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
 
 
 def show_in_terminal(code: str, *, columns: int = 80) -> Shown:

@@ -15,6 +15,8 @@ from tcmrl_data.recipe.about import About, Reference, merged_about, read_about
 from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
 from tests.datasets import part_ids
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 Copy = Callable[[], Path]
 PLAIN = {"description": "a", "citation": "b", "licence": "MIT"}
 FULL = {

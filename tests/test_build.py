@@ -42,6 +42,8 @@ from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import TASKS as TASKS_TABLE
 from tests.conftest import TASKS, TINY
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 Copy = Callable[[], Path]
 
 

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+import tcmrl_data
 from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.build import build
 from tcmrl_data.build.events import EVENTS, BuildEvent
 from tcmrl_data.build.plan import plan_build
 from tcmrl_data.build.unit import UnitSpec, run_unit
@@ -25,6 +25,8 @@ from tcmrl_data.recipe.tasks import choose_tasks
 from tests.conftest import TINY
 from tests.datasets import part_ids
 from tests.platforms import AVX2
+
+pytestmark = pytest.mark.usefixtures("module_in_process")
 
 
 class Interrupted(Exception):
@@ -169,17 +171,14 @@ def test_a_unit_that_can_write_no_checkpoint_is_done_nevertheless(
     assert [message["kind"] for message in messages].count("warning") == 1
 
 
-def test_the_warning_of_a_unit_reaches_the_record_and_the_user(
-    tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_warning_of_a_unit_reaches_the_record_and_the_user(tiny_recipe: Recipe, tmp_path: Path) -> None:
     class Engine(BaseEngine):
         def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
             on_message(units[0].id, {"kind": "warning", "message": "the disk is full"})
             yield Result(units[0].id, False, None, "ended", 1, "here")
 
-    monkeypatch.setattr(build.ENGINES, "get", lambda name: Engine)
     seen: list[BuildEvent] = []
-    build.build_dataset(tiny_recipe, tmp_path / "out", tasks=[3], progress=seen.append)
+    tcmrl_data.build_dataset(tiny_recipe, tmp_path / "out", tasks=[3], engine=Engine(), progress=seen.append)
     assert [event.message for event in seen if event.kind == "warning"] == ["task 3: the disk is full"]
     assert '"task 3: the disk is full"' in (tmp_path / "out" / EVENTS).read_text()
 

@@ -19,7 +19,7 @@ from tcmrl_data.store.manifest import Totals
 from tcmrl_data.verification.tables import write_tables
 from tests.commands import Call, assert_refused, in_process
 from tests.conftest import TASKS
-from tests.terminal import assert_fits, in_terminal
+from tests.terminal import as_in_terminal, assert_fits
 
 Copy = Callable[[], Path]
 MAIN = "from tcmrl_cli.data import main; main()"
@@ -45,7 +45,7 @@ def test_show_puts_a_dataset_on_one_screen(call: Call, tiny: Dataset) -> None:
     assert (document["root"], document["complete"]) == (tiny.manifest.root, True)
     assert document["bytes"] == sum(file.stat().st_size for file in tiny.folder.glob("parts/*/*/*.zip"))
     assert "torch" in document["made_with"]["packages"][0]
-    shown = in_terminal("tcmrl-data", "show", tiny.folder)
+    shown = as_in_terminal(data, "show", tiny.folder)
     assert_fits(shown.output)
     assert len(shown.output.splitlines()) < 40
     assert "profile quick" in shown.output and "A point walks" in shown.output

@@ -1,43 +1,30 @@
 """Progress on standard error, and the format of durations and sizes."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
+import click
 import pytest
+from tcmrl_cli.data import data
 from tcmrl_cli.frame import duration
 from tcmrl_cli.progress import Pace, StageProgress
 
 from tcmrl_data.foundation.sizes import size
+from tests.commands import in_process
 from tests.conftest import TINY
-from tests.terminal import assert_fits, show_in_terminal
+from tests.terminal import as_in_terminal, assert_fits, show_in_terminal
 
 BUILD = ("build", "point-robot", "--profile", "quick")
-MAIN = "from tcmrl_cli.data import main; main()"
 SETTINGS = [argument for text in TINY for argument in ("--set", text)]
 
 
-def test_plain_progress_goes_to_standard_error(tmp_path: Path) -> None:
-    result = subprocess.run(
-        [
-            sys.executable,
-            "-c",
-            MAIN,
-            *BUILD,
-            *SETTINGS,
-            "--tasks",
-            "0",
-            "--out",
-            str(tmp_path / "d"),
-            "--json",
-        ],
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert json.loads(result.stdout)["built"] == 3
-    lines = result.stderr.strip().splitlines()
+@pytest.mark.usefixtures("in_process")
+def test_plain_progress_goes_to_standard_error(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    arguments = (*BUILD, *SETTINGS, "--tasks", 0, "--out", tmp_path / "d", "--json")
+    code, output, errors = in_process(data, capsys)(*arguments)
+    assert code == 0
+    assert json.loads(output)["built"] == 3
+    lines = errors.strip().splitlines()
     assert lines[-1].startswith("published parts: 3 of 3 parts")
     assert not any("\x1b" in line for line in lines)
 
@@ -68,13 +55,13 @@ def test_bars_in_a_terminal_take_one_line_each_and_cut_no_number() -> None:
 
 
 def test_a_detail_is_left_out_where_it_does_not_fit() -> None:
-    code = (
-        "from tcmrl_cli.progress import StageProgress\n"
-        "with StageProgress() as progress:\n"
-        "    progress.update('training', done=5, total=10, unit='steps', detail='45% waiting for data')\n"
-    )
-    assert "45% waiting for data" in show_in_terminal(code).errors
-    narrow = show_in_terminal(code, columns=40).errors
+    @click.command()
+    def training() -> None:
+        with StageProgress() as progress:
+            progress.update("training", done=5, total=10, unit="steps", detail="45% waiting for data")
+
+    assert "45% waiting for data" in as_in_terminal(training).errors
+    narrow = as_in_terminal(training, columns=40).errors
     assert "5/10 steps" in narrow
     assert "waiting" not in narrow
 

@@ -13,13 +13,14 @@ from tcmrl_cli.data import data
 from tcmrl_cli.frame import make_table, print_table
 
 from tcmrl_data import Dataset, recipe_values
-from tests.commands import Call, in_process
-from tests.terminal import assert_fits, in_terminal
+from tests import commands
+from tests.commands import Call
+from tests.terminal import as_in_terminal, assert_fits, in_terminal
 
 
 @pytest.fixture
 def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(data, capsys)
+    return commands.in_process(data, capsys)
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +51,6 @@ def test_the_list_of_datasets_fits_a_terminal_with_root_and_state_whole(shelf: P
         ("envs",),
         ("recipe", "point-robot", "--profile", "quick"),
         ("recipe", "walker-rand-params"),
-        # it measures this machine for ten seconds, twice
         pytest.param(("plan", "half-cheetah-vel", "--profile", "quick"), marks=pytest.mark.sweep),
         ("inspect", "returns", "DATASET"),
         ("inspect", "tasks", "DATASET"),
@@ -64,10 +64,15 @@ def test_the_list_of_datasets_fits_a_terminal_with_root_and_state_whole(shelf: P
     ids=" ".join,
 )
 def test_every_table_fits_a_terminal_and_says_what_it_says_in_a_pipe(
-    command: tuple[str, ...], tiny_folder: Path, call: Call
+    command: tuple[str, ...],
+    tiny_folder: Path,
+    call: Call,
+    in_process: None,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("tcmrl_data.build.probe.UPDATE_SECONDS", 0.1)  # of what `plan` measures
     arguments = [str(tiny_folder) if word == "DATASET" else word for word in command]
-    shown = in_terminal("tcmrl-data", *arguments)
+    shown = as_in_terminal(data, *arguments)
     assert shown.code == 0
     if command[0] not in ("verify", "gc"):  # their one line holds the dataset's path
         assert_fits(shown.output)
@@ -94,7 +99,7 @@ def render(table: Table) -> str:
 
 
 def test_keys_values_and_sources_of_a_recipe_are_whole_in_a_terminal() -> None:
-    shown = in_terminal("tcmrl-data", "recipe", "ml1/box-close", "--set", "rollouts.lanes=25")
+    shown = as_in_terminal(data, "recipe", "ml1/box-close", "--set", "rollouts.lanes=25")
     assert shown.code == 0
     assert_fits(shown.output)
     lines = shown.output.splitlines()

@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from tests.test_imports import loaded_after
-
 BIN = Path(sys.executable).parent
 PROGRAMS = {"tcmrl-data": "_tcmrl_data_completion", "tcmrl": "_tcmrl_completion"}
 
@@ -115,25 +113,3 @@ def test_the_scripts_of_other_shells_are_sound(
         pytest.skip(f"{shell} is not installed")
     (tmp_path / "script").write_text(script)
     subprocess.run([shell, "-n", str(tmp_path / "script")], check=True)
-
-
-@pytest.mark.parametrize(
-    "words", ["tcmrl-data show da", "tcmrl-data build point-robot --set r", "tcmrl train --algo t"]
-)
-def test_completing_loads_nothing_heavy(words: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    program = words.split(" ")[0]
-    module, name = ("data", "data") if program == "tcmrl-data" else ("train", "tcmrl")
-    monkeypatch.chdir(place)
-    monkeypatch.setenv(f"_{program.replace('-', '_').upper()}_COMPLETE", "bash_complete")
-    monkeypatch.setenv("COMP_WORDS", words)
-    monkeypatch.setenv("COMP_CWORD", str(words.count(" ")))
-    code = (
-        f"from tcmrl_cli.{module} import {name}\n"
-        "from tcmrl_cli.frame import run\n"
-        "try:\n"
-        f"    run({name})\n"
-        "except SystemExit as ended:\n"
-        "    assert ended.code == 0\n"
-        "assert not {'pydantic', 'numpy', 'gymnasium'} & sys.modules.keys()\n"
-    )
-    assert loaded_after(code) == set()

@@ -1,7 +1,6 @@
 """Random chains of derive, merge, split and extend over small datasets."""
 
 import shutil
-from collections.abc import Generator, Sequence
 from pathlib import Path
 
 import pytest
@@ -21,11 +20,10 @@ from tcmrl_data import (
     split_dataset,
     verify_dataset,
 )
-from tcmrl_data.curation.publishing import publish_parts
-from tcmrl_data.curation.remaking import RemakeSpec
-from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit
-from tcmrl_data.foundation.errors import BuildError, SelectionError, TcmrlError
+from tcmrl_data.foundation.errors import BuildError, SelectionError
 from tests.graded import graded_dataset
+
+pytestmark = pytest.mark.usefixtures("module_in_process")
 
 OPERATIONS = ["tier", "view", "cut", "tasks", "merge", "fold", "folded view", "episodes"]
 
@@ -34,21 +32,6 @@ def chains_of(operations: list[str]) -> st.SearchStrategy[list[tuple[str, int, i
     """Operations, and which datasets they take."""
     numbers = st.integers(0, 10)
     return st.lists(st.tuples(st.sampled_from(operations), numbers, numbers), min_size=1, max_size=4)
-
-
-class InThisProcess(BaseEngine):
-    """Makes parts without the seconds that it takes to start a process."""
-
-    def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
-        for unit in units:
-            try:
-                digest = publish_parts(
-                    RemakeSpec.from_json(unit.spec),
-                    lambda message: on_message(unit.id, message),  # noqa: B023
-                )
-                yield Result(unit.id, True, digest, None, 1, "here")
-            except TcmrlError as error:
-                yield Result(unit.id, False, None, str(error), 1, "here")
 
 
 @pytest.fixture(scope="module")
@@ -150,9 +133,7 @@ def test_chains_with_extensions_keep_parts_and_splits(
     policies: list[Dataset], tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, int]]
 ) -> None:
     """Extended parts are made again by every deep verification."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ENGINES, "get", lambda name: InThisProcess)
-        check_chain(list(policies), tmp_path_factory.mktemp("chain"), steps)
+    check_chain(list(policies), tmp_path_factory.mktemp("chain"), steps)
 
 
 def _rows(dataset: Dataset, tasks: set[int]) -> set[bytes]:

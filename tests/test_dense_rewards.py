@@ -37,6 +37,8 @@ from tests.graded import graded_dataset
 from tests.made_up import problem, settings
 from tests.sampling import numbered_tasks, sampler_of
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 NAME = "sparse-point-robot"
 OWN_METHODS = [name for name in METHODS.names() if METHODS.get(name).__module__.startswith("tcmrl_algo.")]
 OTHERS = {"context": Trajectories((1, 2)), "windows": Windows(4, length=3)}

@@ -19,6 +19,8 @@ from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_making import make_part
 from tests.commands import assert_refused, in_process
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 KEY = PartKey(3, 100)
 Change = Callable[[list[Trajectory], Snapshot], tuple[list[Trajectory], Snapshot]]
 

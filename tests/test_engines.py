@@ -13,13 +13,15 @@ from pathlib import Path
 from typing import IO
 
 import pytest
+import torch
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
 from tcmrl_data.build.driver import WORKER
 from tcmrl_data.build.unit import UnitSpec
 from tcmrl_data.engine import _attempt
-from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit
+from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit, longest_first
+from tcmrl_data.engine.in_process import InProcessEngine
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import BuildError
@@ -286,6 +288,39 @@ def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_do
     assert staged(tmp_path / "data") == []
     assert list((tmp_path / "data").rglob("*.zip")) == []
     assert run(EngineCase("local", None, ""), [unit])["task 40"].digest == reference(tiny, 40)
+
+
+def test_the_engine_inside_the_process_makes_the_same_parts_and_restores_the_threads(
+    tiny_folder: Path, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)  # not a worker's number, on which bits may depend
+    try:
+        report = tcmrl_data.build_dataset(tiny_recipe, tmp_path, tasks=[0, 3], engine=InProcessEngine())
+        assert torch.get_num_threads() == 2
+    finally:
+        torch.set_num_threads(threads)
+    assert (report.failed, report.built, ids(tmp_path)) == ((), 6, ids(tiny_folder, 0, 3))
+
+
+def test_the_engine_inside_the_process_returns_errors_and_raises_crashes(
+    tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
+) -> None:
+    units = make_units(tiny_recipe, tmp_path / "data", [3, 40])
+    blocked = tmp_path / "data" / part_file(PartKey(3, 100))
+    blocked.parent.mkdir(parents=True)
+    blocked.write_text("in the way")
+    messages: list[tuple[str, str]] = []
+    units = [replace(unit, cost=float(unit.id == "task 40")) for unit in units]
+    results = list(InProcessEngine().run(units, lambda unit, told: messages.append((unit, told["kind"]))))
+    assert [result.id for result in results] == [unit.id for unit in longest_first(units)]
+    done, failed = results
+    assert (done.digest, failed.ok) == (reference(tiny, 40), False)
+    assert str(blocked) in str(failed.error)
+    assert messages.count(("task 40", "part")) == 3
+    crashing = replace(units[0], spec={**units[0].spec, "tasks": ["no task"]})
+    with pytest.raises(ValueError, match="unpack"):
+        list(InProcessEngine().run([crashing], lambda unit, message: None))
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -130,6 +131,24 @@ def test_the_method_of_a_users_package_is_trained_and_evaluated(
     document = json.loads(installation.call("tcmrl", "evaluate", tmp_path / "run", "--json"))
     assert document["algorithm"] == "reward_regression"
     assert np.isfinite(document["mean_final"])
+
+
+def test_the_method_of_a_users_package_passes_the_contract_tests(installation: Installation) -> None:
+    """The command of `docs/how-to/extend.md`, where the package is installed for this one process."""
+    command = "python -m pytest tests/test_algorithms.py -k reward_regression"
+    assert command in (ROOT / "docs/how-to/extend.md").read_text(encoding="utf-8")
+    done = subprocess.run(
+        [sys.executable, *command.split()[1:], "-p", "no:cacheprovider"],
+        cwd=ROOT,
+        env=os.environ | {"PYTHONPATH": str(installation.site)},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout
+    assert "trains_resumes_and_evaluates_by_the_command_line" not in done.stdout  # neither failed nor skipped
+    assert int(re.findall(r"(\d+) passed", done.stdout)[0]) >= 14, done.stdout
 
 
 def test_the_format_of_a_users_package_holds_every_episode(

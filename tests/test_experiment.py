@@ -21,14 +21,13 @@ from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.job import Job, code_commit, run_job
 from tcmrl_algo.experiment.planning import plan_runs, resolve_method
 from tcmrl_algo.experiment.results import RunResult, read_results
-from tcmrl_algo.experiment.runner import EndedRun
 from tcmrl_data import SelectionError, TcmrlError, TrainingError
 from tcmrl_data.foundation.machine import processor
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
 from tests.directed import EXPERIMENT, Directions
-from tests.terminal import assert_fits, in_terminal
+from tests.terminal import as_in_terminal, assert_fits
 from tests.workers import PATIENCE, command_line, marked_pids, wait_for
 
 CLAIM = {"text": "TCMRL ends higher", "better": "TCMRL", "worse": "no context"}
@@ -42,15 +41,9 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
-    """The results folder of the small experiment, run once."""
-    out = tmp_path_factory.mktemp("results") / "small"
-    events: list[EndedRun] = []
-    report = run_experiment(_small(tiny_folder), out, workers=2, report=events.append)
-    assert (report.present, report.failed, len(report.results)) == (0, (), 4)
-    assert [(event.done, event.total) for event in events] == [(done, 4) for done in (1, 2, 3, 4)]
-    assert events[-1].seconds_left == 0
-    return out
+def finished(tmp_path_factory: pytest.TempPathFactory, small_results: Path) -> Path:
+    """The results folder of the small experiment; one of this process, because every call locks it."""
+    return Path(shutil.copytree(small_results, tmp_path_factory.mktemp("results") / "small"))
 
 
 def _small(dataset: Path, **changes: Any) -> Experiment:
@@ -99,7 +92,7 @@ def test_tables_by_protocol_fit_a_terminal_with_every_number_whole(
     finished: Path, tiny_folder: Path, tmp_path: Path
 ) -> None:
     file = experiments.write_file(tmp_path / "small.toml", experiments.tables(tiny_folder))
-    shown = in_terminal("tcmrl", "experiment", file, "--out", finished)
+    shown = as_in_terminal(tcmrl, "experiment", file, "--out", finished)
     tables = shown.output[: shown.output.index(str(finished))]  # a line of words wraps, nothing is lost
     assert_fits(tables)
     lines = [line.split() for line in tables.splitlines()]
@@ -236,7 +229,7 @@ def test_the_list_of_experiments_says_what_each_asks(call: Call) -> None:
     rows = json.loads(call("experiment", "--list", "--json")[1])["experiments"]
     assert [row["name"] for row in rows] == experiment_names()
     assert all(row["title"] and row["methods"] and row["seeds"] for row in rows)
-    shown = in_terminal("tcmrl", "experiment", "--list")
+    shown = as_in_terminal(tcmrl, "experiment", "--list")
     assert_fits(shown.output)
     assert all(name in shown.output for name in experiment_names())
 
@@ -266,6 +259,24 @@ def test_a_methods_changes_go_over_the_environments_over_the_experiments(tiny_fo
     assert latent() == 6
 
 
+def test_the_process_of_a_run_makes_the_result_that_this_process_makes(
+    finished: Path, tiny_folder: Path, tmp_path: Path
+) -> None:
+    """All but the seconds and the memory."""
+    (result,) = run_experiment(_small(tiny_folder), tmp_path, only=["TCMRL"], seeds=[1], workers=2).results
+    here = read_record(RunResult, finished / "runs/point-robot--tcmrl--seed1.json")
+    assert _without_costs(result) == _without_costs(here)
+
+
+def _without_costs(result: RunResult) -> dict[str, Any]:
+    document: dict[str, Any] = json.loads(result.model_dump_json())
+    for one in (document, *document["curve"]):
+        for name in [name for name in one if name.endswith(("seconds", "memory"))]:
+            del one[name]
+    return document
+
+
+@pytest.mark.usefixtures("in_process")
 def test_a_failed_run_is_told_and_tried_again(tiny_folder: Path, tmp_path: Path, call: Call) -> None:
     content = experiments.tables(tiny_folder, seeds=[0])
     content["methods"] |= {
@@ -283,6 +294,7 @@ def test_a_failed_run_is_told_and_tried_again(tiny_folder: Path, tmp_path: Path,
     assert call(*arguments, "--quiet")[0] == 1
 
 
+@pytest.mark.usefixtures("in_process")
 def test_what_never_began_takes_a_new_device_and_new_threads(
     tiny_folder: Path, tmp_path: Path, call: Call
 ) -> None:

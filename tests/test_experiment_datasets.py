@@ -18,6 +18,8 @@ from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
 
+pytestmark = pytest.mark.usefixtures("in_process")
+
 
 @pytest.fixture
 def call(capsys: pytest.CaptureFixture[str]) -> Call:

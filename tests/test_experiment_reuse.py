@@ -13,11 +13,14 @@ from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.planning import PlannedRun, plan_runs
 from tcmrl_algo.tuning.record import RECORD, Trial, Tuning
 from tcmrl_data import CheckpointError, TrainingError
+from tcmrl_data.engine.in_process import InProcessEngine
 from tcmrl_data.foundation.records import write_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
 
 METHODS = {"TCMRL": {"algorithm": "tcmrl"}}
+
+pytestmark = pytest.mark.usefixtures("in_process")
 
 
 def _experiment(dataset: Path, **changes: Any) -> Experiment:
@@ -29,7 +32,7 @@ def _experiment(dataset: Path, **changes: Any) -> Experiment:
 def source(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ExperimentReport]:
     """An experiment with one finished run."""
     out = tmp_path_factory.mktemp("source") / "results"
-    return out, run_experiment(_experiment(tiny_folder), out, workers=1)
+    return out, run_experiment(_experiment(tiny_folder), out, workers=1, engine=InProcessEngine())
 
 
 def _with_run(dataset: Path, **run: Any) -> Experiment:

@@ -19,6 +19,8 @@ from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.platform import _machine
 from tests.commands import assert_refused, in_process
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 CopyTiny = Callable[[], Path]
 CHEETAH = (
     "environment.horizon=20",

@@ -3,9 +3,11 @@
 import ast
 import importlib
 import json
+import os
 import subprocess
 import sys
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 
 import jaxtyping
@@ -14,7 +16,10 @@ import torch
 
 import tcmrl_algo
 import tcmrl_data
+from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.losses import context as losses
+from tcmrl_data.envs.base import ENVIRONMENTS
+from tests.plugin_packages import install
 
 ROOT = Path(__file__).parents[1]
 FOLDERS = {
@@ -24,62 +29,141 @@ FOLDERS = {
     "manifests": "tcmrl_manifests",
 }
 HEAVY = {"torch", "stable_baselines3", "metaworld", "mujoco", "matplotlib", "tensorboard"}
+SLOW = HEAVY | {"gymnasium", "numpy", "pydantic"}
+"""What completions and helps do without."""
 
-
-def loaded_after(code: str, *arguments: str) -> set[str]:
-    """The heavy libraries that a fresh interpreter holds after running code."""
-    script = f"import json, sys\n{code}\nprint(json.dumps(sorted(sys.modules)), file=sys.stderr)"
-    result = subprocess.run(
-        [sys.executable, "-c", script, *arguments], capture_output=True, text=True, check=True
-    )
-    return HEAVY & set(json.loads(result.stderr.splitlines()[-1]))
-
-
-@pytest.mark.parametrize(
-    "arguments",
-    [
-        ["--help"],
-        ["build", "--help"],
-        ["envs"],
-        ["recipe", "point-robot", "--profile", "quick"],
-        ["list", "PARENT"],
-        ["inspect", "returns", "DATASET"],
-        ["inspect", "returns", "DATASET", "--recompute"],
-        ["inspect", "tasks", "DATASET"],
-        ["inspect", "snapshots", "DATASET"],
-        ["inspect", "episodes", "DATASET"],
-        ["inspect", "quality", "DATASET"],
-        ["inspect", "coverage", "DATASET"],
-        ["inspect", "rewards", "DATASET"],
-        ["export", "DATASET", "--format", "hdf5", "--out", "OUT"],
-    ],
-    ids=" ".join,
+COMPLETIONS = (
+    "tcmrl-data show da",
+    "tcmrl-data build point-robot --set r",
+    "tcmrl train --algo t",
 )
-def test_looking_at_data_loads_nothing_heavy(arguments: list[str], tiny_folder: Path, tmp_path: Path) -> None:
-    places = {"PARENT": str(tiny_folder.parent), "DATASET": str(tiny_folder), "OUT": str(tmp_path / "out")}
-    code = (
-        "from tcmrl_cli.data import data\n"
-        "from tcmrl_cli.frame import run\n"
-        "assert run(data, sys.argv[1:]) == 0\n"
-    )
-    assert loaded_after(code, *(places.get(argument, argument) for argument in arguments)) == set()
+HELPS = ("tcmrl-data --help", "tcmrl-data build --help", "tcmrl train --help", "tcmrl evaluate --help")
+LOOKS = (
+    "tcmrl-data envs",
+    "tcmrl-data recipe point-robot --profile quick",
+    "tcmrl-data list data",
+    "tcmrl-data inspect returns data/point-robot",
+    "tcmrl-data inspect returns data/point-robot --recompute",
+    "tcmrl-data inspect tasks data/point-robot",
+    "tcmrl-data inspect snapshots data/point-robot",
+    "tcmrl-data inspect episodes data/point-robot",
+    "tcmrl-data inspect quality data/point-robot",
+    "tcmrl-data inspect coverage data/point-robot",
+    "tcmrl-data inspect rewards data/point-robot",
+    "tcmrl-data export data/point-robot --format hdf5 --out out",
+)
+PLOT = "tcmrl-data inspect returns data/point-robot --plot returns.png"
+
+PROBE = """
+import contextlib, importlib, io, json, os, sys
+
+def command(line, complete=False):
+    from tcmrl_cli.frame import run
+    program, *words = line.split(" ")
+    name = {"tcmrl-data": "data", "tcmrl": "tcmrl"}[program]
+    root = getattr(importlib.import_module("tcmrl_cli." + {"data": "data", "tcmrl": "train"}[name]), name)
+    if not complete:
+        return run(root, words)
+    variable = "_" + program.replace("-", "_").upper() + "_COMPLETE"
+    os.environ |= {variable: "bash_complete", "COMP_WORDS": line, "COMP_CWORD": str(len(words))}
+    try:
+        return run(root)
+    except SystemExit as ended:
+        return ended.code
+    finally:
+        del os.environ[variable]
+
+def environments():
+    from tcmrl_data.envs.base import ENVIRONMENTS
+    print(len(ENVIRONMENTS.members()))
+    return 0
+
+steps = {
+    **{f"import {name}": lambda name=name: importlib.import_module(name) is None for name in sys.argv[1:]},
+    **{"complete " + line: lambda line=line: command(line, complete=True) for line in COMPLETIONS},
+    **{line: lambda line=line: command(line) for line in (*HELPS, *LOOKS, PLOT)},
+    "environments": environments,
+}
+steps[PLOT] = steps.pop(PLOT)
+for name, step in steps.items():
+    with contextlib.redirect_stdout(io.TextIOWrapper(io.BytesIO(), "utf-8", write_through=True)) as output:
+        code = int(step())
+    print(json.dumps([name, code, output.buffer.getvalue().decode(), sorted(sys.modules)]))
+"""
 
 
-def test_a_plot_loads_matplotlib_and_no_window(tiny_folder: Path, tmp_path: Path) -> None:
-    code = (
-        "from tcmrl_cli.data import data\n"
-        "from tcmrl_cli.frame import run\n"
-        "assert run(data, sys.argv[1:]) == 0\n"
-        "assert 'matplotlib.pyplot' not in sys.modules\n"
+@dataclass(frozen=True)
+class Done:
+    """What a step printed, and all modules that the interpreter held after it."""
+
+    output: str
+    modules: frozenset[str]
+
+
+@pytest.fixture(scope="module")
+def done(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Done]:
+    """Imports and commands, done in this order in one fresh interpreter; what loads something comes last."""
+    place = tmp_path_factory.mktemp("place")
+    (place / "data").mkdir()
+    (place / "data" / "point-robot").symlink_to(tiny_folder)
+    declares = {"tcmrl.engines": "cloud = users_engine:Cloud"}
+    modules = {"users_engine": "raise RuntimeError('imported')"}
+    install(place / "site", "users-package", modules=modules, declares=declares)
+    named = {"COMPLETIONS": COMPLETIONS, "HELPS": HELPS, "LOOKS": LOOKS, "PLOT": PLOT}
+    code = "\n".join(f"{name} = {value!r}" for name, value in named.items()) + PROBE
+    result = subprocess.run(
+        [sys.executable, "-c", code, "tcmrl_data", "tcmrl_algo"],
+        cwd=place,
+        env=os.environ | {"PYTHONPATH": str(place / "site")},
+        capture_output=True,
+        text=True,
+        check=False,
     )
-    arguments = ["inspect", "returns", str(tiny_folder), "--plot", str(tmp_path / "returns.png")]
-    assert loaded_after(code, *arguments) == {"matplotlib"}
+    assert result.returncode == 0, result.stderr
+    steps = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [name for name, code, _, _ in steps if code != 0] == [], result.stderr
+    return {name: Done(output, frozenset(modules)) for name, _, output, modules in steps}
+
+
+@pytest.mark.parametrize("line", LOOKS)
+def test_looking_at_data_loads_nothing_heavy(line: str, done: dict[str, Done]) -> None:
+    assert done[line].modules & HEAVY == set()
+
+
+@pytest.mark.parametrize("line", COMPLETIONS)
+def test_completing_loads_nothing_slow(line: str, done: dict[str, Done]) -> None:
+    assert done[f"complete {line}"].output.strip()
+    assert done[f"complete {line}"].modules & SLOW == set()
+
+
+@pytest.mark.parametrize("line", HELPS)
+def test_help_loads_nothing_slow_and_no_plugin(line: str, done: dict[str, Done]) -> None:
+    assert done[line].modules & (SLOW | {"users_engine"}) == set()
+
+
+def test_help_names_plugins_and_shows_examples(done: dict[str, Done]) -> None:
+    assert "--engine [cloud|local|ray]" in done["tcmrl-data build --help"].output
+    assert "tcmrl train data/point-robot" in done["tcmrl train --help"].output
+    assert "|".join([*PROTOCOLS.names(), "all"]) in done["tcmrl evaluate --help"].output
+
+
+def test_listing_environments_imports_nothing_heavy(done: dict[str, Done]) -> None:
+    assert int(done["environments"].output) == len(ENVIRONMENTS.members())
+    assert done["environments"].modules & HEAVY == set()
+
+
+def test_a_plot_loads_matplotlib_and_no_window(done: dict[str, Done]) -> None:
+    assert list(done)[-1] == PLOT
+    assert done[PLOT].modules & HEAVY == {"matplotlib"}
+    assert "matplotlib.pyplot" not in done[PLOT].modules
 
 
 @pytest.mark.parametrize("package", [tcmrl_data, tcmrl_algo], ids=lambda package: package.__name__)
-def test_roots_load_nothing_until_asked_and_keep_what_they_promise(package: object) -> None:
+def test_roots_load_nothing_until_asked_and_keep_what_they_promise(
+    package: object, done: dict[str, Done]
+) -> None:
     name = package.__name__  # type: ignore[attr-defined]
-    assert loaded_after(f"import {name}") == set()
+    assert done[f"import {name}"].modules & SLOW == set()
     root = importlib.import_module(name)
     assert all(getattr(root, name) is not None for name in root.__all__)
     assert set(root.__all__) <= set(dir(root))

@@ -3,18 +3,16 @@
 import json
 import shutil
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import Any, final
+from typing import Any
 
 import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, Dataset, Recipe, load_recipe, open_dataset, repair_dataset, verify_dataset
-from tcmrl_data.build import build, ledger
-from tcmrl_data.build.unit import UnitSpec, run_unit
-from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
+from tcmrl_data.build import ledger
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError, ManifestError, TaskError
 from tcmrl_data.store import limits, manifest, tables
@@ -24,6 +22,8 @@ from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import parse_tasks, task_line
 from tests.conftest import TINY
 from tests.simulated_disk import PreparedParts, at_last_part
+
+pytestmark = pytest.mark.usefixtures("module_in_process")
 
 TASK = 3
 LAST = PartKey(TASK, 150)
@@ -43,24 +43,6 @@ GROUP = (
     "rollouts.episodes=2",
     "rollouts.lanes=2",
 )
-
-
-@final
-class HereEngine(BaseEngine):
-    """Runs units in this process."""
-
-    name = "here"
-
-    def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
-        for unit in units:
-            digest = run_unit(UnitSpec.from_json(unit.spec), lambda message: on_message(unit.id, message))  # noqa: B023
-            yield Result(unit.id, True, digest, None, 1, "here")
-
-
-@pytest.fixture
-def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Builds do their work in this process."""
-    monkeypatch.setattr(build.ENGINES, "get", lambda name: HereEngine)
 
 
 @pytest.fixture(scope="module")
@@ -240,7 +222,6 @@ def test_a_dropped_task_does_not_count_until_it_is_named_again(
     assert verify_dataset(out).findings == ()
 
 
-@pytest.mark.usefixtures("here")
 def test_the_other_tasks_of_a_group_keep_their_ids_when_one_is_dropped(tmp_path: Path) -> None:
     recipe = load_recipe("point-robot", profile="quick", overrides=GROUP, behavior="stacked")
     tcmrl_data.build_dataset(recipe, tmp_path / "all", tasks=[1, 2, 3])
@@ -337,7 +318,6 @@ def test_a_manifest_seals_as_many_lines_as_a_writer_may_write(
                 read_manifest(file)
 
 
-@pytest.mark.usefixtures("here")
 def test_a_field_with_a_new_default_leaves_older_datasets_as_they_are(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -375,7 +355,6 @@ def test_a_field_with_a_new_default_leaves_older_datasets_as_they_are(
         tcmrl_data.build_dataset(other, out, tasks=[0])
 
 
-@pytest.mark.usefixtures("here")
 def test_a_build_says_what_it_makes_again(tmp_path: Path) -> None:
     recipe, out = load_recipe("point-robot", profile="quick", overrides=SHORT), tmp_path / "data"
     tcmrl_data.build_dataset(recipe, out, tasks=[0])

@@ -32,6 +32,8 @@ from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_making import make_part
 from tests.commands import assert_refused, in_process
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 REQUEST = BatchRequest(tasks=2, kinds={"policy": Transitions(4)})
 SMALL = (
     "environment.horizon=20",

@@ -27,6 +27,8 @@ from tcmrl_data.store.keys import PartKey
 from tests.commands import Call, assert_refused, in_process
 from tests.environments import environment_of, episodes, parameters_of, some_members
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 NAMES = [name for family in ENVIRONMENTS.working().values() for name in some_members(family)[:1]]
 TASK = 40
 SIMULATED = (

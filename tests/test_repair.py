@@ -30,6 +30,8 @@ from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import making_again
 from tests.damage import data_files, found, ids_of, rot
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 Copy = Callable[[], Path]
 
 

@@ -17,6 +17,8 @@ from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import making_again
 from tests.hostile.datasets import base, copies_of
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 BYTES = {MANIFEST, TASKS, PARTS_TABLE}
 
 Copy = Callable[[], Path]

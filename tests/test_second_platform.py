@@ -5,19 +5,17 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import final
 
 import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, load_recipe, open_dataset, verify_dataset
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.build import build, unit
+from tcmrl_data.build import unit
 from tcmrl_data.build.events import EVENTS
-from tcmrl_data.build.unit import UnitSpec, run_unit
-from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
+from tcmrl_data.engine.in_process import InProcessEngine
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK
 from tcmrl_data.store.keys import PartKey, part_file
 from tests.conftest import TASKS, TINY
@@ -29,18 +27,6 @@ RECIPE = ["point-robot", "--profile", "quick", *(word for text in TINY for word 
 
 class Killed(Exception):
     """Ends a build in the middle."""
-
-
-@final
-class HereEngine(BaseEngine):
-    """Runs units in this process, on this platform."""
-
-    name = "here"
-
-    def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:
-        for one in units:
-            digest = run_unit(UnitSpec.from_json(one.spec), functools.partial(on_message, one.id))
-            yield Result(one.id, True, digest, None, 1, "here")
 
 
 def elsewhere(*arguments: object) -> str:
@@ -77,11 +63,10 @@ def half_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
         if event.kind == "part" and event.parts_done == 2:
             raise Killed
 
-    monkeypatch.setattr(build.ENGINES, "get", lambda name: HereEngine)
     monkeypatch.setattr(unit, "CheckpointFolder", functools.partial(CheckpointFolder, seconds=0.0))
     recipe, out = load_recipe("point-robot", profile="quick", overrides=TINY), tmp_path / "data"
     with pytest.raises(Killed):
-        tcmrl_data.build_dataset(recipe, out, tasks=[0], progress=kill)
+        tcmrl_data.build_dataset(recipe, out, tasks=[0], engine=InProcessEngine(), progress=kill)
     assert len(list((out / CHECKPOINTS).rglob("*.safetensors"))) == 1
     return out
 

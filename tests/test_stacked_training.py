@@ -32,6 +32,8 @@ from tcmrl_data.verification.garbage import collect_garbage
 from tcmrl_data.verification.repair import repair_dataset
 from tests.datasets import part_ids
 
+pytestmark = pytest.mark.usefixtures("module_in_process")
+
 TINY = (
     "behavior.stacked.group=4",
     "behavior.stacked.steps=130",

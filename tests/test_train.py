@@ -1,8 +1,6 @@
 """Training: determinism, resuming, checkpoints, metrics, and `tcmrl train`."""
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -306,14 +304,6 @@ def test_resume_refuses_another_seed(start: Train, tiny_folder: Path, call: Call
     folder = start("run", steps=10, seed=1).run.folder
     result = call("train", tiny_folder, "--resume", "--seed", 2, "--out", folder)
     assert_refused(result, "--seed 1", "not 2")
-
-
-def test_help_shows_examples_and_imports_no_torch() -> None:
-    code = "import sys; from tcmrl_cli.train import tcmrl; tcmrl(['train', '--help'], standalone_mode=False);"
-    code += "sys.exit('torch' in sys.modules or 'stable_baselines3' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "tcmrl train data/point-robot" in done.stdout
 
 
 def test_public_names_load() -> None:

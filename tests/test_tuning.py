@@ -29,6 +29,7 @@ from tcmrl_algo.tuning.proposals import GENERATION, RANDOM_TRIALS, known_to, pro
 from tcmrl_algo.tuning.record import Trial
 from tcmrl_algo.tuning.space import Dimension, space_on
 from tcmrl_data import Dataset, SelectionError, TrainingError
+from tcmrl_data.engine.in_process import InProcessEngine
 from tcmrl_data.foundation.errors import CheckpointError, MissingPackageError
 from tcmrl_data.store.part_record import References
 from tests.commands import Call, assert_refused, in_process
@@ -36,6 +37,8 @@ from tests.experiments import SMALL
 from tests.graded import graded_dataset
 
 pytest.importorskip("optuna")
+
+pytestmark = pytest.mark.usefixtures("in_process")
 
 SETTINGS = tuple(
     f"{section}.{key}={json.dumps(value)}" for section, table in SMALL.items() for key, value in table.items()
@@ -77,6 +80,7 @@ def tuned(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[
         protocols=("offline", "paper"),
         overrides=SETTINGS,
         workers=2,
+        engine=InProcessEngine(),
         report=events.append,
     )
     assert [(event.done, event.total) for event in events] == [(1, 2), (2, 2)]

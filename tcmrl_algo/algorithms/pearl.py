@@ -121,7 +121,7 @@ class Pearl(Method[PearlConfig]):
 
     name = "pearl"
     Config = PearlConfig
-    capabilities = Capabilities(explores=True, needs_trajectories=False)
+    capabilities = Capabilities(explores=True, noisy_contexts=True, needs_trajectories=False)
     search: ClassVar[Search] = {**SHARED_SEARCH, "pearl.kl_weight": Factors(0.01, 100.0)}
 
     def batch_request(self, settings: TrainingSettings, config: PearlConfig) -> BatchRequest:

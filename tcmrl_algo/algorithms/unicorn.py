@@ -30,7 +30,7 @@ from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner,
 from tcmrl_algo.context_methods.requests import trajectory_request
 from tcmrl_algo.losses.context import distance_metric_loss
 from tcmrl_algo.losses.mutual_information import gaussian_reconstruction, task_classification
-from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig, Metrics
+from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig, Metrics
 from tcmrl_algo.methods.problem import Problem
 from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
 from tcmrl_algo.networks.attention import mean_representation
@@ -153,6 +153,7 @@ class Unicorn(Method[UnicornConfig]):
     """The plug-in."""
 
     name = "unicorn"
+    capabilities = Capabilities(noisy_contexts=True)
     Config = UnicornConfig
     search: ClassVar[Search] = {**SHARED_SEARCH, "unicorn.beta": Factors(0.1, 10.0)}
 

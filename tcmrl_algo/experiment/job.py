@@ -219,9 +219,10 @@ def _peak_memory() -> int:
     return 0
 
 
-def _serve(spec: dict[str, Any], report: Send) -> str:
+def work(spec: dict[str, Any], report: Send) -> str:
+    """Does the run of a job in JSON; the digest of its tensors."""
     return run_job(Job.model_validate(spec), report)
 
 
 if __name__ == "__main__":
-    serve(_serve)
+    serve(work)

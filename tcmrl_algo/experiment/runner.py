@@ -15,7 +15,7 @@ from tcmrl_algo.experiment.reuse import finished_trainings, take_over
 from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_algo.training.train import usable_device
 from tcmrl_data import TrainingError
-from tcmrl_data.engine.base import ENGINES, Unit
+from tcmrl_data.engine.base import BaseEngine, Unit, make_engine
 from tcmrl_data.foundation.disk import lock_file, make_folders, replace_file
 from tcmrl_data.foundation.records import read_record, write_record
 
@@ -76,6 +76,7 @@ def run_experiment(
     steps: int | None = None,
     workers: int | None = None,
     device: str = "cpu",
+    engine: str | BaseEngine = "local",
     tuned: TunedSettings | None = None,
     reuse: Sequence[str | Path] = (),
     report: Callable[[EndedRun], None] = ignore,
@@ -94,6 +95,7 @@ def run_experiment(
             whether or not there are so many runs; a run that was begun keeps the threads that it had, on
             which its last bits depend.
         device: a torch device, for runs that are not begun yet.
+        engine: what runs them, by name or made before; `workers` says how the cores are shared either way.
         tuned: settings by environment and algorithm, as `tuned_settings` reads them.
         reuse: other results folders, whose finished trainings are taken over where they are the same, so
             that only what was not evaluated there is done.
@@ -138,7 +140,7 @@ def run_experiment(
             error_file(Path(job.folder)).unlink(missing_ok=True)
         present = len(plan) - len(jobs)
         _write_table(out, experiment)
-        for name, error in _run(jobs, workers):
+        for name, error in _run(jobs, make_engine(engine, workers)):
             folder = out / "runs" / name
             result = None if error else read_record(RunResult, result_file(folder))
             found[name] = result
@@ -217,7 +219,7 @@ def _job(run: PlannedRun, experiment: Experiment, out: Path, *, threads: int, de
     )
 
 
-def _run(jobs: dict[str, Job], workers: int) -> Iterator[tuple[str, str | None]]:
+def _run(jobs: dict[str, Job], engine: BaseEngine) -> Iterator[tuple[str, str | None]]:
     """Yields the id of every run as it ends, with its error or None; closing the iterator ends the others."""
     units = [
         Unit(
@@ -228,7 +230,6 @@ def _run(jobs: dict[str, Job], workers: int) -> Iterator[tuple[str, str | None]]
         )
         for name, job in jobs.items()
     ]
-    engine = ENGINES.get("local")(workers)
     with contextlib.closing(engine.run(units, lambda unit, message: None)) as results:
         for result in results:
             yield result.id, None if result.ok else result.error

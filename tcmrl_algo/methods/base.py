@@ -32,7 +32,9 @@ class Capabilities:
 
     Attributes:
         blind: trajectories do not change how it acts.
-        explores: it collects its first episodes in its own way instead of uniformly.
+        explores: it can collect its first episodes in its own way instead of uniformly.
+        explores_by_default: one that explores does so under its default settings.
+        noisy_contexts: the contexts that it trains on are drawn with noise.
         stateful: its controllers adapt within an episode.
         privileged: it may see task parameters, as a control; every record of its runs says so.
         needs_trajectories: it cannot adapt without a trajectory.
@@ -40,6 +42,8 @@ class Capabilities:
 
     blind: bool = False
     explores: bool = False
+    explores_by_default: bool = True
+    noisy_contexts: bool = False
     stateful: bool = False
     privileged: bool = False
     needs_trajectories: bool = True

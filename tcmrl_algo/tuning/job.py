@@ -26,9 +26,10 @@ def run_trial(job: Job, report: Send) -> str:
         return DIVERGED
 
 
-def _serve(spec: dict[str, Any], report: Send) -> str:
+def work(spec: dict[str, Any], report: Send) -> str:
+    """Does the run of a job in JSON; the digest of its tensors, or `DIVERGED`."""
     return run_trial(Job.model_validate(spec), report)
 
 
 if __name__ == "__main__":
-    serve(_serve)
+    serve(work)

@@ -11,7 +11,7 @@ from tcmrl_algo.experiment.results import AGAIN, RunResult, error_file, result_f
 from tcmrl_algo.tuning.plan import TuningPlan
 from tcmrl_algo.tuning.record import Trial, TrialRun
 from tcmrl_data import Dataset, TrainingError
-from tcmrl_data.engine.base import ENGINES, Unit
+from tcmrl_data.engine.base import BaseEngine, Unit
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.records import read_record, write_record
 
@@ -19,7 +19,14 @@ WORKER = "tcmrl_algo.tuning.job"
 
 
 def run_trials(
-    plan: TuningPlan, view: Dataset, out: Path, trials: Sequence[Trial], *, workers: int, device: str
+    plan: TuningPlan,
+    view: Dataset,
+    out: Path,
+    trials: Sequence[Trial],
+    *,
+    workers: int,
+    device: str,
+    engine: BaseEngine,
 ) -> Iterator[Trial | str]:
     """Yields every trial as it ends, or why a run of it crashed; closing the iterator ends what runs.
 
@@ -28,8 +35,9 @@ def run_trials(
         view: the training tasks, of which the held-out ones are the test tasks.
         out: folder of the tuning.
         trials: those to do; runs of theirs that ended before are taken over.
-        workers: runs at a time.
+        workers: runs at a time, which share the cores as threads.
         device: a torch device.
+        engine: what runs them.
 
     Raises:
         CheckpointError: a finished run is of other settings.
@@ -48,7 +56,7 @@ def run_trials(
     missing = {trial.number: {key for key in waiting if key[0] == trial.number} for trial in trials}
     folders = {key: Path(job.folder) for key, job in jobs.items()}
     yield from (_scored(plan, trial, folders) for trial in trials if not missing[trial.number])
-    with contextlib.closing(_run(waiting, workers)) as results:
+    with contextlib.closing(_run(waiting, engine)) as results:
         for key, crash in results:
             if crash is not None:
                 yield f"{folders[key].name}: {crash}"
@@ -94,7 +102,7 @@ def _is_finished(job: Job) -> bool:
 
 
 def _run(
-    jobs: Mapping[tuple[int, int], Job], workers: int
+    jobs: Mapping[tuple[int, int], Job], engine: BaseEngine
 ) -> Generator[tuple[tuple[int, int], str | None], None, None]:
     """Yields the trial and the seed of every run as it ends, and the reason if it crashed."""
     keys = {Path(job.folder).name: key for key, job in jobs.items()}
@@ -107,7 +115,6 @@ def _run(
         )
         for name, key in keys.items()
     ]
-    engine = ENGINES.get("local")(workers)
     with contextlib.closing(engine.run(units, lambda unit, message: None)) as results:
         for result in results:
             yield keys[result.id], None if result.ok else result.error

@@ -14,6 +14,7 @@ from tcmrl_algo.tuning.proposals import GENERATION, known_to, propose
 from tcmrl_algo.tuning.record import RECORD, Trial, Tuning, read_tuning
 from tcmrl_algo.tuning.trials import run_trials
 from tcmrl_data import Dataset, Profile, TrainingError
+from tcmrl_data.engine.base import BaseEngine, make_engine
 from tcmrl_data.foundation.disk import lock_file, make_folders
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.records import write_record
@@ -75,6 +76,7 @@ def tune_method(
     overrides: Sequence[str] = (),
     workers: int | None = None,
     device: str = "cpu",
+    engine: str | BaseEngine = "local",
     report: Callable[[EndedTrial], None] = ignore,
 ) -> TuningReport:
     """Searches a method's settings, and writes all trials and the best one to `out/tuning.json`.
@@ -99,6 +101,7 @@ def tune_method(
         overrides: `section.key=value` texts that all trials share; what they set is not searched.
         workers: runs at a time, which share the cores as threads; one per core if None.
         device: a torch device.
+        engine: what runs them, by name or made before; `workers` says how the cores are shared either way.
         report: called as trials end.
 
     Raises:
@@ -130,6 +133,8 @@ def tune_method(
         overrides=overrides,
     )
     tuning = _continued(plan, out)
+    workers = workers or available_cores()
+    runner = make_engine(engine, workers)
     make_folders(out)
     with lock_file(out / ".lock", f"tuning {out}"):
         view = open_view(dataset, out, plan.tuning.held_out)
@@ -140,9 +145,7 @@ def tune_method(
             tuning = _proposed(tuning, numbers)
             write_record(out / RECORD, tuning)
             waiting = [tuning.trials[number] for number in numbers if not tuning.trials[number].is_done]
-            for ended in run_trials(
-                plan, view, out, waiting, workers=workers or available_cores(), device=device
-            ):
+            for ended in run_trials(plan, view, out, waiting, workers=workers, device=device, engine=runner):
                 if isinstance(ended, str):
                     failed.append(ended)
                     continue

@@ -11,7 +11,7 @@ from tcmrl_data.build.events import BuildEvent, EventLog
 from tcmrl_data.build.ledger import Ledger
 from tcmrl_data.build.plan import plan_build
 from tcmrl_data.build.work_files import ASSEMBLY, WORK_FILES, WORK_FOLDERS, check_work_files
-from tcmrl_data.engine.base import ENGINES
+from tcmrl_data.engine.base import BaseEngine, make_engine
 from tcmrl_data.foundation.canonical import differences
 from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
@@ -58,7 +58,7 @@ def build_dataset(
     tasks: Sequence[int] | None = None,
     dropped: Sequence[int] = (),
     workers: int | None = None,
-    engine: str = "local",
+    engine: str | BaseEngine = "local",
     address: str | None = None,
     progress: Callable[[BuildEvent], None] = lambda event: None,
 ) -> BuildReport:
@@ -72,7 +72,7 @@ def build_dataset(
         dropped: indices of tasks that the dataset is to do without; their parts stay on disk, and a later
             build that names them in `tasks` takes them up again.
         workers: units run at the same time; as many as the engine has cores where None.
-        engine: an engine's name.
+        engine: an engine's name, or an engine, which has its own workers and address.
         address: of the engine's cluster, where it has one.
         progress: called as the build goes on.
 
@@ -86,7 +86,7 @@ def build_dataset(
     started = time.monotonic()
     if not 0 <= seed < SEEDS:
         raise BuildError(f"seed {seed} is not in [0, 2**63); choose a smaller --seed")
-    runner = ENGINES.get(engine)(workers, address=address)
+    runner = make_engine(engine, workers, address)
     plan = plan_build(recipe, seed=seed, tasks=tasks, dropped=dropped)
     _check_folder(out, recipe, seed)
     plan.check_limits()

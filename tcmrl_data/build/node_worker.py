@@ -12,7 +12,8 @@ from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.shared_folder import wait_until_visible
 
 
-def _describe(spec: dict[str, Any], report: Send) -> str:
+def work(spec: dict[str, Any], report: Send) -> str:
+    """Reports what the machine sees of the dataset's folder, its version and its platform."""
     sees = wait_until_visible(Path(spec["token"]), deadline=spec["deadline"])
     report({"kind": "node", "sees_folder": sees, "tcmrl": version("tcmrl")})
     if sees and version("tcmrl") == spec["tcmrl"]:
@@ -30,4 +31,4 @@ def _platform(recipe: dict[str, Any]) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    serve(_describe)
+    serve(work)

@@ -69,7 +69,8 @@ def _rate(marks: list[tuple[float, int]]) -> float:
     return (marks[-1][0] - marks[0][0]) / steps if steps else 0.0
 
 
-def _measure(values: dict[str, Any], send: Send) -> str:
+def work(values: dict[str, Any], send: Send) -> str:
+    """Measures the unit of these values and sends what it measured."""
     import torch
 
     torch.set_num_threads(1)  # as a build's workers
@@ -131,4 +132,4 @@ def _measure_parts(spec: UnitSpec, plan: BuildPlan, task: Task, snapshot: Snapsh
 
 
 if __name__ == "__main__":
-    serve(_measure)
+    serve(work)

@@ -6,7 +6,8 @@ from tcmrl_data.build.unit import UnitSpec, run_unit
 from tcmrl_data.engine.worker import Send, serve
 
 
-def _build_parts(spec: dict[str, Any], report: Send) -> str:
+def work(spec: dict[str, Any], report: Send) -> str:
+    """Makes and publishes the parts of a unit; the digest of their ids."""
     import torch
 
     torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently
@@ -14,4 +15,4 @@ def _build_parts(spec: dict[str, Any], report: Send) -> str:
 
 
 if __name__ == "__main__":
-    serve(_build_parts)
+    serve(work)

@@ -7,7 +7,8 @@ from tcmrl_data.curation.remaking import RemakeSpec
 from tcmrl_data.engine.worker import Send, serve
 
 
-def _remake(spec: dict[str, Any], report: Send) -> str:
+def work(spec: dict[str, Any], report: Send) -> str:
+    """Makes and publishes the parts of some jobs; the digest of their ids."""
     import torch
 
     torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently
@@ -15,4 +16,4 @@ def _remake(spec: dict[str, Any], report: Send) -> str:
 
 
 if __name__ == "__main__":
-    serve(_remake)
+    serve(work)

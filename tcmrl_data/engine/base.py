@@ -22,7 +22,7 @@ class Unit:
     Attributes:
         id: name of the unit in messages and logs.
         spec: JSON values that the worker reads.
-        worker: module that the process runs; it calls `tcmrl_data.engine.worker.serve`.
+        worker: module that the process runs; it passes its `work` to `tcmrl_data.engine.worker.serve`.
         threads: threads of the process's numerical libraries.
         cost: relative duration; the longest unit starts first.
         cpus: cores to reserve, on engines that use several machines.
@@ -121,6 +121,18 @@ class BaseEngine(abc.ABC):
 
 
 ENGINES = Registry("tcmrl.engines", "engine", BaseEngine)
+
+
+def make_engine(
+    engine: str | BaseEngine, workers: int | None = None, address: str | None = None
+) -> BaseEngine:
+    """The engine of a name, with these arguments; an engine that is made already is used as it is.
+
+    Raises:
+        UnknownNameError: there is no engine of this name.
+        BuildError: an address is given, but the engine takes none.
+    """
+    return ENGINES.get(engine)(workers, address=address) if isinstance(engine, str) else engine
 
 
 def longest_first(units: Sequence[Unit]) -> list[Unit]:

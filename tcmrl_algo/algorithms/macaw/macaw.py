@@ -149,7 +149,7 @@ class Macaw(Method[MacawConfig]):
 
     name = "macaw"
     Config = MacawConfig
-    capabilities = Capabilities(explores=True, needs_trajectories=False)
+    capabilities = Capabilities(explores=True, explores_by_default=False, needs_trajectories=False)
     search: ClassVar[Search] = {
         "macaw.policy_learning_rate": Factors(1 / 3, 3.0),
         "macaw.inner_learning_rate": Factors(0.1, 10.0),
