@@ -16,7 +16,7 @@ HOSTILE = (
     "<script>document.title='taken'</script><img src=https://example.com/x onerror=document.title='taken'>"
 )
 
-pytestmark = pytest.mark.sweep
+pytestmark = pytest.mark.check
 
 OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 

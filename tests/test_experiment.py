@@ -314,7 +314,7 @@ def test_what_never_began_takes_a_new_device_and_new_threads(
 
 
 @pytest.mark.parametrize(
-    "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.sweep)], ids=str
+    "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.check)], ids=str
 )
 def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
     end: signal.Signals, tiny_folder: Path, tmp_path: Path
