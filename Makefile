@@ -1,7 +1,9 @@
 # make demo   the whole main job on a small environment, from nothing
-# make test   the tests, but for the sweeps that take minutes
-# make check  what continuous integration runs
+# make test   the tests that a change should pass at once
+# make check  what continuous integration runs: linters, types, and all tests but the sweeps
+# make sweeps what takes hours: every kill, every fault, a million parts; before a release
 # make docs   the documentation as a site, in build/docs
+# make results   results/README.md from the tables beside it
 PYTHON ?= python3
 SEED ?= 0
 JOBS ?= 2
@@ -21,7 +23,7 @@ export MPLBACKEND ?= Agg
 # Hundreds of processes would compile the packages again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check format docs docs-links clean
+.PHONY: demo test check sweeps format docs docs-links results clean
 
 $(BIN)/python:
 	@$(PYTHON) -c "import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), 'Python 3.11 to 3.13 needed: make PYTHON=python3.11'"
@@ -49,14 +51,18 @@ demo: $(INSTALLED)
 	@echo "Next: $(BIN)/tcmrl experiment tour --data $(DATA)"
 
 test: $(INSTALLED_TEST)
-	$(BIN)/python -m pytest $(SPREAD) -m "not sweep"
+	$(BIN)/python -m pytest $(SPREAD) -m "not check and not sweep"
 
 check: $(INSTALLED_TEST)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest $(SPREAD)
+	$(BIN)/python -m pytest $(SPREAD) -m "not sweep"
+
+sweeps: $(INSTALLED_TEST)
+	$(BIN)/python -m pytest $(SPREAD) --sweep 1 -m sweep
+	$(BIN)/python -m tests.kill_sweep --kills 200
 
 format: $(INSTALLED_TEST)
 	$(BIN)/ruff check --fix .
@@ -69,6 +75,9 @@ docs: $(INSTALLED_DOCS)
 
 docs-links: $(INSTALLED_DOCS)
 	$(SPHINX) --builder linkcheck docs build/docs-links
+
+results: $(INSTALLED)
+	$(BIN)/tcmrl report results/runs.csv
 
 clean:
 	rm -rf $(VENV) build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis

@@ -76,8 +76,8 @@ NUM_SEEDS = 10_000
 @click.option(
     "--tuned",
     type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Take the best settings of the tunings in FOLDER, each in ENV-ALGO, for all methods alike.",
+    metavar="TUNINGS",
+    help="Take the best settings of the tunings in a folder, each in ENV-ALGO, or in a table of them.",
 )
 @click.option(
     "--reuse",

@@ -1,4 +1,4 @@
-"""`tcmrl report`: write tables, figures and verdicts on finished runs, or a leaderboard of them."""
+"""`tcmrl report`: tables, figures and verdicts on finished runs, rows of them, and a page of such rows."""
 
 import dataclasses
 from pathlib import Path
@@ -16,13 +16,14 @@ from .progress import StageProgress
     "--out",
     type=click.Path(path_type=Path),
     metavar="FOLDER",
-    show_default="report or leaderboard in the first of RUNS; of an earlier report itself",
+    show_default="report in the first of RUNS; of an earlier report itself; of a table its folder",
     help="Folder of the report.",
 )
 @click.option(
-    "--leaderboard",
-    is_flag=True,
-    help="Write a leaderboard of all methods in RUNS instead of a report.",
+    "--rows",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Also add the runs to this table of results, such as results/runs.csv.",
 )
 @click.option(
     "--dataset",
@@ -36,7 +37,7 @@ from .progress import StageProgress
 def report(
     runs: tuple[Path, ...],
     out: Path | None,
-    leaderboard: bool,
+    rows: Path | None,
     datasets: tuple[Path, ...],
     as_json: bool,
     quiet: bool,
@@ -55,28 +56,39 @@ def report(
     Beside the report stand a small JSON document per run and what was measured of checkpoints and
     datasets. They are enough to write the same report again, elsewhere and later.
 
-    With --leaderboard, leaderboard.md contains the returns of every method in every environment under every
-    protocol, mean ranks, budgets, costs, and who was tuned how. Only results on one dataset are ranked
-    together. It needs the JSON documents of the runs alone.
+    With --rows, a table of results gets a row per run and protocol, under the name of the results folder;
+    rows of the same runs are replaced. Tunings of `tcmrl tune` (folders) and documents of
+    `tcmrl-data inspect worth --json` (files) can be added to tables of their own; no report is written of
+    them.
+
+    Where RUNS is such a table, its page is written: README.md, by README.md.jinja beside the table, or with
+    a board of every experiment and environment. Tables named curves.csv, tuning.csv and worth.csv beside it
+    are read too.
 
     \b
     Examples:
       tcmrl report results/figure5
-      tcmrl report results/figure5 results/figure10 --out docs/results/ablations
-      tcmrl report docs/results/ablations
-      tcmrl report results/table1 results/table2 --leaderboard --out docs/results/leaderboard
+      tcmrl report results/figure5 results/figure10 --out reports/ablations
       tcmrl report runs/point-robot-tcmrl-seed0 --out report
       tcmrl report results/figure5 --dataset /disk/point-robot
+      tcmrl report results/figure5 --rows results/runs.csv
+      tcmrl report tuning/point-robot-tcmrl --rows results/tuning.csv
+      tcmrl report results/runs.csv
     """
-    from tcmrl_algo import write_leaderboard, write_report
+    from tcmrl_algo import write_report
 
-    write = write_leaderboard if leaderboard else write_report
-    default = runs[0] / "leaderboard" if leaderboard else _default_out(runs[0])
+    if runs[0].suffix == ".csv":
+        _write_page(runs, out, rows, as_json=as_json)
+        return
+    if rows is not None and (runs[0].suffix == ".json" or (runs[0] / "tuning.json").is_file()):
+        _add(runs, rows, as_json=as_json)
+        return
     with StageProgress(quiet=quiet) as progress:
-        written = write(
+        written = write_report(
             runs,
-            out or default,
+            out or _default_out(runs[0]),
             datasets=datasets,
+            rows=rows,
             report=lambda stage, done, total: progress.update(stage, done=done, total=total, unit="parts"),
         )
     if as_json:
@@ -87,12 +99,35 @@ def report(
         place = ", ".join(filter(None, (verdict.environment, verdict.protocol)))
         click.echo(f"{verdict.verdict}: {verdict.claim} ({place})")
     click.echo(f"{written.report}: written, with {len(written.files) - 1} other files")
-    if leaderboard:
-        return
+    if rows is not None:
+        click.echo(f"{rows}: the runs are in it; `tcmrl report {rows}` writes its page")
     remark(
         "Verdicts compare methods run by run, corrected for the number of verdicts by Holm's method.",
         quiet=quiet,
     )
+
+
+def _write_page(tables: tuple[Path, ...], out: Path | None, rows: Path | None, *, as_json: bool) -> None:
+    from tcmrl_algo import write_results_page
+
+    if len(tables) > 1 or rows is not None:
+        raise click.UsageError("A page is written of one table; name it alone.")
+    files = [str(file) for file in write_results_page(tables[0], out)]
+    if as_json:
+        print_json({"report": files[0], "files": files})
+    else:
+        click.echo(f"{files[0]}: written, with {len(files) - 1} other files")
+
+
+def _add(sources: tuple[Path, ...], rows: Path, *, as_json: bool) -> None:
+    """Adds tunings, or documents of what a context is worth, to a table."""
+    from tcmrl_algo import add_tunings, add_worth
+
+    added = len(add_worth(rows, sources) if sources[0].suffix == ".json" else add_tunings(rows, sources))
+    if as_json:
+        print_json({"table": str(rows), "rows": added})
+    else:
+        click.echo(f"{rows}: {added} rows written")
 
 
 def _default_out(folder: Path) -> Path:

@@ -30,6 +30,7 @@ repository_pages = {
     "index": "README.md",
     "changelog": "CHANGELOG.md",
     "contributing": "CONTRIBUTING.md",
+    "measured": "results/README.md",
     "how-to/pendulum": "examples/pendulum/README.md",
 }
 # Pages that links to folders of the repository lead to.

@@ -40,7 +40,9 @@ from .methods.stages import Stage as Stage
 from .methods.stages import StagedOptimizer as StagedOptimizer
 from .methods.stages import StagePlan as StagePlan
 from .methods.state import TrainedModules as TrainedModules
-from .reporting.leaderboard import write_leaderboard as write_leaderboard
+from .reporting.results_page import write_results_page as write_results_page
+from .reporting.rows import add_tunings as add_tunings
+from .reporting.rows import add_worth as add_worth
 from .reporting.write import WrittenReport as WrittenReport
 from .reporting.write import write_report as write_report
 from .settings.training import TrainingSettings as TrainingSettings

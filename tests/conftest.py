@@ -59,9 +59,18 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--tiny", type=Path, help="the tiny dataset, if it was made before")
 
 
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leaves out exhaustive cases, and tests that need a separate network: test_namespace.py runs these."""
-    left_out = set() if config.getoption("--sweep") == 1 else {"exhaustive"}
+    """Leaves out exhaustive cases, and tests that need a separate network: test_namespace.py runs these.
+
+    With `--sweep 1`, exhaustive cases and tests that try every n-th case count as sweeps.
+    """
+    left_out = {"exhaustive"}
+    if config.getoption("--sweep") == 1:
+        left_out.clear()
+        for item in items:
+            if item.get_closest_marker("exhaustive") or "sweep" in getattr(item, "fixturenames", ()):
+                item.add_marker("sweep")
     if not has_only_loopback():
         left_out.add("loopback")
     elsewhere = [item for item in items if any(map(item.get_closest_marker, left_out))]

@@ -4,9 +4,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from tcmrl_algo import TrainingConfig, resolve, run_experiment
+from tcmrl_algo import TrainingConfig, resolve, run_experiment, write_report
 from tcmrl_algo.experiment.config import read_experiment, run_id
-from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.experiment.results import CurvePoint, RunResult
 from tcmrl_algo.experiment.runner import EndedRun
 from tcmrl_data import load_recipe
 from tcmrl_data.engine.in_process import InProcessEngine
@@ -112,6 +112,30 @@ def write_results(folder: Path, content: dict[str, Any], results: list[RunResult
         name = run_id(result.environment, result.method, result.seed, result.fold)
         write_record(folder / "runs" / f"{name}.json", result)
     return folder
+
+
+def made_report(folder: Path) -> Path:
+    """The report of an experiment of two methods and five seeds that never was."""
+    content = tables(folder, seeds=[0, 1, 2, 3, 4], protocols=["offline"])
+    finals = {"TCMRL": [1.0, 2.0, 3.0, 4.0, 5.0], "no context": [0.0, 0.5, 0.25, 0.0, 0.125]}
+    shared: dict[str, Any] = {
+        "stage": "train",
+        "regret": None,
+        "normalized": None,
+        "shuffled": 0.0,
+        "timed_steps": 20,
+    }
+    shared |= {"peak_memory": 10**8, "device_memory": 0}
+    curve = [
+        CurvePoint(step=step, final=step / 10, seconds=1.0, evaluation_seconds=1.0, **shared)
+        for step in (20, 40)
+    ]
+    results = [
+        made_result(method, seed, final, curve=curve)
+        for method, values in finals.items()
+        for seed, final in enumerate(values)
+    ]
+    return write_report([write_results(folder / "made", content, results)], folder / "report").report.parent
 
 
 def run_small(dataset: Path, out: Path) -> None:

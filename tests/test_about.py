@@ -97,7 +97,7 @@ def test_about_changes_no_id_and_no_root(tiny: Dataset, tiny_copy: Copy) -> None
     assert tcmrl_data.verify_dataset(folder).findings == ()
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_a_build_that_says_other_things_of_itself_gives_the_same_ids(
     tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
 ) -> None:

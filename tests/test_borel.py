@@ -290,7 +290,7 @@ def test_it_collects_by_the_policy_under_the_belief_or_by_uniform_actions() -> N
     assert isinstance(algorithm(explore="uniform").explore(lanes), UniformController)
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_beliefs_narrow_along_stored_episodes_and_predict_rewards_of_their_own_task(
     tiny: Dataset, tmp_path: Path
 ) -> None:

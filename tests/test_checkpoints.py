@@ -198,7 +198,7 @@ print(checkpoints.load() is not None)
 """
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_a_checkpoint_of_another_platform_is_ignored(tiny_recipe: Recipe, tmp_path: Path) -> None:
     spec = json.dumps(UnitSpec(tmp_path, tiny_recipe, 0, plan_build(tiny_recipe, tasks=[3]).tasks).to_json())
     found = [

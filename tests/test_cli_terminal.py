@@ -51,7 +51,7 @@ def test_the_list_of_datasets_fits_a_terminal_with_root_and_state_whole(shelf: P
         ("envs",),
         ("recipe", "point-robot", "--profile", "quick"),
         ("recipe", "walker-rand-params"),
-        pytest.param(("plan", "half-cheetah-vel", "--profile", "quick"), marks=pytest.mark.sweep),
+        pytest.param(("plan", "half-cheetah-vel", "--profile", "quick"), marks=pytest.mark.check),
         ("inspect", "returns", "DATASET"),
         ("inspect", "tasks", "DATASET"),
         ("inspect", "snapshots", "DATASET"),

@@ -159,7 +159,7 @@ def test_a_fixed_policy_keeps_believing_in_its_own_task() -> None:
     assert controller.act(np.array([[1.0, 2.0], [3.0, 4.0]]), noise[0]).tolist() == [[1.0, 8.0], [3.0, 8.0]]
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_the_entries_that_tell_a_hidden_goal_are_found() -> None:
     settings = {"name": "ml1/reach", "task_seed": 1337, "tasks": 50, "train": 40, "horizon": 500}
     environment = make_environment(settings)

@@ -117,7 +117,7 @@ def check_chain(held: list[Dataset], folder: Path, steps: list[tuple[str, int, i
     shutil.rmtree(folder)
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 @settings(max_examples=25)
 @given(steps=chains_of(OPERATIONS))
 def test_chains_keep_parts_and_splits(
@@ -126,7 +126,7 @@ def test_chains_keep_parts_and_splits(
     check_chain(list(seeds), tmp_path_factory.mktemp("chain"), steps)
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 @settings(max_examples=6)
 @given(steps=chains_of(["extend", "extend", *OPERATIONS]))
 def test_chains_with_extensions_keep_parts_and_splits(

@@ -203,7 +203,7 @@ def test_training_takes_dense_rewards(dataset: Dataset, tmp_path: Path, name: st
     assert len(digests) == 2
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_a_build_stores_dense_rewards_that_verify_and_replay(tmp_path: Path) -> None:
     small = (
         "behavior.source=sac",

@@ -211,7 +211,7 @@ def test_a_poison_unit_is_named_the_others_are_done_and_the_exit_code_is_1(
     [
         pytest.param("local", signal.SIGINT, id="local-SIGINT"),
         *(
-            pytest.param(*case.values, signal.SIGTERM, marks=[*case.marks, pytest.mark.sweep])
+            pytest.param(*case.values, signal.SIGTERM, marks=[*case.marks, pytest.mark.check])
             for case in CASES
         ),
     ],

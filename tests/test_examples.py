@@ -15,7 +15,7 @@ import pytest
 from tests.plugin_packages import install
 from tests.workers import PATIENCE, ROOT
 
-pytestmark = pytest.mark.sweep  # two wheels are built and installed first
+pytestmark = pytest.mark.check  # two wheels are built and installed first
 
 TINY = (
     "behavior.sac.steps=60",

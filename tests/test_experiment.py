@@ -18,10 +18,11 @@ from tcmrl_cli.train import tcmrl
 import tcmrl_data
 from tcmrl_algo import METHODS, experiment_names, load_experiment, open_run, run_experiment, train_run
 from tcmrl_algo.experiment.config import Experiment, read_experiment
-from tcmrl_algo.experiment.job import Job, run_job
+from tcmrl_algo.experiment.job import Job, code_commit, run_job
 from tcmrl_algo.experiment.planning import plan_runs, resolve_method
 from tcmrl_algo.experiment.results import RunResult, read_results
 from tcmrl_data import SelectionError, TcmrlError, TrainingError
+from tcmrl_data.foundation.machine import processor
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
@@ -65,6 +66,8 @@ def test_one_document_per_run_and_one_table(finished: Path, tiny_folder: Path) -
     assert result.peak_memory is not None and result.peak_memory > 50e6
     assert result.threads == result.config.settings.run.threads == max(1, len(os.sched_getaffinity(0)) // 2)
     assert {"torch", "tcmrl"} <= set(result.versions)
+    assert result.behavior_seed == tcmrl_data.open_dataset(tiny_folder).manifest.seed
+    assert (result.commit, result.processor) == (code_commit(), processor())
     rows = list(csv.DictReader((finished / "table.csv").read_text().splitlines()))
     assert [row["method"] for row in rows] == ["TCMRL"] * 4 + ["no context"] * 4
     assert float(rows[2]["final"]) == result.evaluations["offline"]["mean_final"]
@@ -311,7 +314,7 @@ def test_what_never_began_takes_a_new_device_and_new_threads(
 
 
 @pytest.mark.parametrize(
-    "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.sweep)], ids=str
+    "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.check)], ids=str
 )
 def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
     end: signal.Signals, tiny_folder: Path, tmp_path: Path

@@ -103,7 +103,7 @@ def test_folds_test_every_task_once_with_every_seed(tiny_folder: Path, tmp_path:
         plan_runs(_small(tiny_folder, folds=6), data=tmp_path, views=tmp_path / "six")
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_an_experiment_with_folds_is_run_continued_and_reported(tiny_folder: Path, tmp_path: Path) -> None:
     methods = {"A": {"algorithm": "no_context"}}
     claim = {"text": "", "better": "A", "worse": "A", "against": "shuffled", "protocols": ["offline"]}
@@ -121,7 +121,7 @@ def test_an_experiment_with_folds_is_run_continued_and_reported(tiny_folder: Pat
     assert "2 seeds × 2 folds, 5 test tasks" in written.report.read_text()
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_build_makes_what_is_missing_and_then_runs(tmp_path: Path, call: Call) -> None:
     content = experiments.tables(tmp_path / "data", seeds=[0], claims=[])
     content["methods"] = {"A": {"algorithm": "no_context"}}

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from tcmrl_cli.train import tcmrl
 
-from tcmrl_algo import ExperimentReport, run_experiment, tuned_settings
+from tcmrl_algo import ExperimentReport, add_tunings, run_experiment, tuned_settings
 from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.planning import PlannedRun, plan_runs
 from tcmrl_algo.tuning.record import RECORD, Trial, Tuning
@@ -160,6 +160,23 @@ def test_what_a_file_sets_goes_over_tuned_settings(tiny_folder: Path, tmp_path: 
     experiment = _experiment(tiny_folder, methods=methods, environments={"point-robot": place})
     plans = plan_runs(experiment, data=tmp_path, tuned=found)
     assert [_searched(plan) for plan in plans] == [(0.1, 0.7), (0.1, 0.5)]
+
+
+def test_a_table_of_tunings_gives_the_settings_of_their_folder(tiny_folder: Path, tmp_path: Path) -> None:
+    for name, trials in (("point-robot-tcmrl", 3), ("point-robot-focal", 3), ("failed-tcmrl", 2)):
+        _tune(tmp_path, name, trials=trials, **({"score": None} if name.startswith("failed") else {}))
+    table = tmp_path / "tuning.csv"
+    folders = sorted(path for path in tmp_path.iterdir() if path.is_dir())
+    assert len(add_tunings(table, folders)) == 8
+    assert len(add_tunings(table, folders[:1])) == 2  # in place of the same rows
+    both = METHODS | {"FOCAL": {"algorithm": "focal"}}
+    experiment = _experiment(tiny_folder, methods=both)
+    assert tuned_settings(experiment, table) == tuned_settings(experiment, tmp_path)
+    with pytest.raises(TrainingError, match=r"tuning.csv: point-robot-corro holds no .* --out tuning/point"):
+        tuned_settings(_experiment(tiny_folder, methods={"CORRO": {"algorithm": "corro"}}), table)
+    places = {"point-robot": {"dataset": str(tiny_folder), "profile": "quick", "tuning": "failed"}}
+    with pytest.raises(TrainingError, match="no trial ended well"):
+        tuned_settings(_experiment(tiny_folder, environments=places), table)
 
 
 def _searched(plan: PlannedRun) -> tuple[float, float]:

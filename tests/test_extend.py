@@ -186,7 +186,7 @@ def test_a_part_in_the_way_is_named_and_a_damaged_one_made_again(tiny_copy: Copy
     assert extend_dataset(folder, episodes=3, tasks=[0], workers=1).root == expected
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_a_killed_extension_goes_on(tiny_copy: CopyTiny) -> None:
     folder, whole = tiny_copy(), tiny_copy()
     arguments = ["--episodes", "3", "--snapshots", "all", "--workers", "1"]
@@ -205,7 +205,7 @@ def test_a_killed_extension_goes_on(tiny_copy: CopyTiny) -> None:
     assert verify_dataset(folder).findings == ()
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_repair_makes_extended_parts_and_their_sources_again(tiny_copy: CopyTiny) -> None:
     folder = tiny_copy()
     extend_dataset(folder, episodes=3, tasks=[0], noise=0.1, workers=1)

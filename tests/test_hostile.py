@@ -22,7 +22,7 @@ from tcmrl_data.verification import making_again
 from tcmrl_data.verification.findings import Finding
 from tests.hostile.arrays import CHUNKS
 from tests.hostile.case import Case
-from tests.hostile.corpus import CASES
+from tests.hostile.corpus import CASES, CORPUS
 from tests.hostile.datasets import FORGED_TASKS, Forge, base, copies_of
 from tests.hostile.files import FILES
 from tests.hostile.manifests import MANIFESTS
@@ -38,6 +38,9 @@ ADDRESS_SPACE = 2**30
 
 SECONDS = 240
 """After which a case counts as blocked; the slowest takes a few."""
+
+SAMPLED = 8
+"""`make test` tries every eighth case of each kind, `make check` all."""
 
 COMMANDS = [
     "inspect tasks",
@@ -166,7 +169,18 @@ def test_the_corpus_is_large_and_its_base_is_sound(two_parts: Path) -> None:
     assert verify_dataset(two_parts, level="deep", replay=1).findings == ()
 
 
-@pytest.mark.parametrize("case", CASES, ids=lambda case: case.name.replace(" ", "-"))
+def named(case: Case, *marks: pytest.MarkDecorator) -> Any:
+    return pytest.param(case, id=case.name.replace(" ", "-"), marks=marks)
+
+
+@pytest.mark.parametrize(
+    "case",
+    [
+        named(case, *([] if position % SAMPLED == 0 else [pytest.mark.check]))
+        for cases in CORPUS
+        for position, case in enumerate(cases)
+    ],
+)
 def test_a_hostile_dataset_is_refused(forge: Forge, case: Case, capsys: pytest.CaptureFixture[str]) -> None:
     case.damage(forge)
     with guarded(forge):
@@ -211,9 +225,7 @@ REPAIRED = [
 @pytest.mark.parametrize(
     "case",
     [
-        pytest.param(
-            case, id=case.name.replace(" ", "-"), marks=() if position % 8 == 0 else pytest.mark.exhaustive
-        )
+        named(case, pytest.mark.check if position % 8 == 0 else pytest.mark.exhaustive)
         for position, case in enumerate(REPAIRED)
     ],
 )

@@ -65,7 +65,13 @@ def test_the_corpus_is_large() -> None:
     assert len(CASES) >= 40
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param(case, marks=() if position % 4 == 0 else pytest.mark.check)
+        for position, case in enumerate(CASES)
+    ],
+)
 def test_a_hostile_file_is_refused(case: str, places: Places, tmp_path: Path) -> None:
     path = CASES[case](places)
     before = sorted(tmp_path.rglob("*"))

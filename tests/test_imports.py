@@ -171,7 +171,7 @@ def test_roots_load_nothing_until_asked_and_keep_what_they_promise(
         _ = root.nothing
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_a_worker_loads_torchs_compiler_only_if_it_compiles() -> None:
     code = (
         "import torch\n"

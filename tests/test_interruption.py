@@ -70,7 +70,7 @@ def test_a_run_killed_before_its_first_checkpoint_says_that_it_begins_anew(
     assert said == ["no checkpoint was saved: starting at step 0"]
 
 
-@pytest.mark.slow
+@pytest.mark.check
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_command_that_an_interrupted_training_prints_goes_on(
     tiny_folder: Path, tmp_path: Path, call: Call, number: signal.Signals
@@ -94,7 +94,7 @@ def test_the_command_that_an_interrupted_training_prints_goes_on(
     assert open_run(folder).newest().step == step + 5
 
 
-@pytest.mark.slow
+@pytest.mark.check
 def test_a_build_interrupted_until_it_ends_gives_one_line_and_exit_code_1(tmp_path: Path) -> None:
     folder = tmp_path / "dataset"
     with command_line("build", "point-robot", "--workers", "1", "--out", str(folder)) as process:

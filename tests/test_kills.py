@@ -26,20 +26,27 @@ def expect_nothing_lost(figures: Figures, kills: int) -> None:
     assert {name: value for name, value in asdict(figures).items() if name not in counted and value} == {}
 
 
+ARGUMENTS = ["--tasks", "0,5,12,15,20,30", *(word for override in TINY for word in ("--set", override))]
+
+
+@pytest.mark.check
+def test_a_killed_build_loses_nothing() -> None:
+    expect_nothing_lost(run_sweep(build(ARGUMENTS, pause=5.0), 1, seed=0), 1)
+
+
 @pytest.mark.sweep
 def test_killed_builds_lose_nothing_and_leave_nobody_behind() -> None:
     """Twenty kills; `python -m tests.kill_sweep` does two hundred on the quick profile itself."""
-    arguments = ["--tasks", "0,5,12,15,20,30", *(word for override in TINY for word in ("--set", override))]
-    figures = run_sweep(build(arguments, pause=5.0), 20, seed=0)
+    figures = run_sweep(build(ARGUMENTS, pause=5.0), 20, seed=0)
     expect_nothing_lost(figures, 20)
     assert min(figures.driver_kills, figures.worker_kills, figures.finished) > 0
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 @pytest.mark.parametrize("command", ["derive", "merge", "extend", "import"])
-def test_killed_commands_lose_nothing(command: str, tiny_folder: Path, tmp_path: Path) -> None:
-    """A few kills; the next test does fifty of every command."""
-    expect_nothing_lost(run_sweep(cases(tmp_path, tiny_folder)[command], 2, seed=0), 2)
+def test_a_killed_command_loses_nothing(command: str, tiny_folder: Path, tmp_path: Path) -> None:
+    """One kill; the next test does fifty of every command."""
+    expect_nothing_lost(run_sweep(cases(tmp_path, tiny_folder)[command], 1, seed=0), 1)
 
 
 @pytest.mark.exhaustive
@@ -57,7 +64,7 @@ go_on(sys.argv[1], int(sys.argv[2]), lambda episodes: print(episodes, flush=True
 """
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_a_killed_recording_loses_the_open_episode_alone(tmp_path: Path, sweep: int) -> None:
     """A recorder that is killed goes on behind the last episode whose end it has told."""
     from tests.test_recording import go_on

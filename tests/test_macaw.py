@@ -231,7 +231,7 @@ def test_it_collects_by_uniform_actions_or_the_policy_of_the_start_with_noise() 
     assert isinstance(learner().explore(lanes), UniformController)
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_adaptation_to_stored_trajectories_raises_the_return(tiny: Dataset, tmp_path: Path) -> None:
     steps = 600
     overrides = (f"run.steps={steps}", f"run.checkpoint_every={steps}", "batch.context_trajectories=[4]")

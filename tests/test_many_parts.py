@@ -18,7 +18,7 @@ from tests.commands import in_process
     ("num_tasks", "snapshots"),
     [
         (263, 100),
-        pytest.param(1_000, 100, marks=pytest.mark.sweep),
+        pytest.param(1_000, 100, marks=pytest.mark.check),
         pytest.param(MAX_PARTS // 100, 100, marks=pytest.mark.exhaustive),
         pytest.param(MAX_TASKS, MAX_PARTS // MAX_TASKS, marks=pytest.mark.exhaustive),
     ],

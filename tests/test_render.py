@@ -194,7 +194,7 @@ def test_without_open_gl_a_line_says_what_to_install(chosen: str) -> None:
         film(environment, episode, frames=1, width=64, height=48)
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 @pytest.mark.parametrize("kind", ["egl", "osmesa"])
 def test_a_process_that_draws_ends_without_a_word(kind: str, tmp_path: Path) -> None:
     script = (
@@ -219,7 +219,7 @@ class Blank(FigureCamera):
         pass
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_derived_parts_start_again_from_the_seeds_of_their_sources(tmp_path: Path) -> None:
     recipe = tcmrl_data.load_recipe("half-cheetah-vel", profile="quick", overrides=SIMULATED)
     built, more, other, less = (tmp_path / name for name in ("built", "more", "other", "less"))

@@ -8,13 +8,13 @@ from tcmrl_algo.reporting.compose import Page, Picture, compose
 from tcmrl_algo.reporting.html import page_html
 from tcmrl_algo.reporting.tables import Table
 from tcmrl_algo.reporting.write import measure_paths, page_text
-from tests.workers import ROOT
+from tests.experiments import made_report
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 
 
-def test_the_page_says_what_the_markdown_says() -> None:
-    folder = ROOT / "docs/results/tour"
+def test_the_page_says_what_the_markdown_says(tmp_path: Path) -> None:
+    folder = made_report(tmp_path)
     page, _ = compose(measure_paths([folder]), folder)
     made = page_html(page)
     text = html.unescape(re.sub(r"<[^>]+>", "", made))

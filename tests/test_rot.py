@@ -65,7 +65,7 @@ def write(file: Path, data: bytes | None) -> None:
 
 @pytest.mark.parametrize(
     "rounds",
-    [9, pytest.param(30, marks=pytest.mark.sweep), pytest.param(89, marks=pytest.mark.exhaustive)],
+    [9, pytest.param(89, marks=pytest.mark.exhaustive)],
 )
 def test_rot_is_named_and_repaired(
     sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rounds: int
@@ -99,7 +99,7 @@ def test_rot_is_named_and_repaired(
     assert cases == rounds * 18
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_a_dataset_all_of_whose_parts_rotted_is_made_again(sound: Path, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(sound, folder)

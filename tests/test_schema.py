@@ -85,7 +85,7 @@ def test_manifests_of_derived_merged_and_imported_datasets_satisfy_the_schema(
         schema.validate(documents(tcmrl_data.open_dataset(tmp_path / name))["manifest"])
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_manifests_of_extended_and_relabelled_datasets_satisfy_the_schema(
     tiny: Dataset, tiny_copy: Copy, tmp_path: Path
 ) -> None:

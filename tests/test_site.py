@@ -20,7 +20,7 @@ pytest.importorskip("sphinx", reason="needs the extra `docs`")
 
 OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 
-pytestmark = pytest.mark.sweep  # imports everything, and takes 15 seconds of one core
+pytestmark = pytest.mark.check  # imports everything, and takes 15 seconds of one core
 
 
 def build(docs: Path, out: Path, *options: str) -> "subprocess.CompletedProcess[str]":

@@ -178,7 +178,7 @@ def test_other_settings_are_refused(tuned: tuple[Path, TuningReport], call: Call
     assert_refused(call(*command, "--set", "tcmrl.weights.distanc=1"), "distanc")
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_an_interrupted_tuning_goes_on_and_ends_as_an_uninterrupted_one(
     tuned: tuple[Path, TuningReport], tmp_path: Path, call: Call
 ) -> None:
@@ -198,7 +198,7 @@ def test_an_interrupted_tuning_goes_on_and_ends_as_an_uninterrupted_one(
     assert read_tuning(out).trials == (first, second)
 
 
-@pytest.mark.sweep
+@pytest.mark.check
 def test_a_trial_that_diverges_has_no_score_and_is_not_repeated(
     tuned: tuple[Path, TuningReport], tmp_path: Path
 ) -> None:

@@ -5,6 +5,7 @@ killed one goes on from the newest checkpoint and ends in the same tensors.
 """
 
 import importlib.metadata
+import subprocess
 import time
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,10 @@ from tcmrl_algo.training.config import TrainingConfig, stage_plan
 from tcmrl_algo.training.train import TrainingProgress, resume_run, train_run
 from tcmrl_data import CheckpointError, Dataset, open_dataset
 from tcmrl_data.engine.worker import Send, serve
+from tcmrl_data.foundation.machine import processor
 from tcmrl_data.foundation.records import read_record, write_record
 
+CODE = Path(__file__).parents[2]
 MEANS = ("final", "regret", "normalized", "shuffled")
 
 
@@ -129,7 +132,7 @@ def run_job(job: Job, report: Send) -> str:
         curve = (*curve, point)
         if step < job.points()[-1]:
             write_record(file, Curve(points=curve))
-    result = _result(job, curve, evaluations)
+    result = _result(job, dataset, curve, evaluations)
     write_record(result_file(folder), result)
     return result.digest
 
@@ -163,7 +166,9 @@ def _train_to(step: int, job: Job, dataset: Dataset, report: Send) -> tuple[int,
     return step, done.seconds
 
 
-def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: dict[str, dict[str, Any]]) -> RunResult:
+def _result(
+    job: Job, dataset: Dataset, curve: tuple[CurvePoint, ...], evaluations: dict[str, dict[str, Any]]
+) -> RunResult:
     run = open_run(job.folder)
     timed, seconds = sum(point.timed_steps for point in curve), sum(point.seconds for point in curve)
     steps, shared = run.record.steps, job.shared
@@ -188,7 +193,22 @@ def _result(job: Job, curve: tuple[CurvePoint, ...], evaluations: dict[str, dict
         peak_memory=shared.peak_memory if shared else memory,
         tuned=job.tuned,
         training_of=shared.training_of if shared else None,
+        behavior_seed=dataset.manifest.seed,
+        commit=code_commit(),
+        processor=torch.cuda.get_device_name() if run.record.device.startswith("cuda") else processor(),
     )
+
+
+def code_commit() -> str | None:
+    """The commit of this package's code, as `RunResult.commit`."""
+    if not (CODE / ".git").exists():
+        return None
+    describe = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
+    try:
+        found = subprocess.run(describe, cwd=CODE, capture_output=True, text=True, check=True)
+    except (OSError, subprocess.CalledProcessError):
+        return None
+    return found.stdout.strip()
 
 
 def _peak_memory() -> int:

@@ -131,6 +131,10 @@ class RunResult(_Record):
         tuned: where its settings come from, if they were tuned.
         training_of: `experiment, method` whose training it shares, if it was not trained for this one.
         contexts: what a report measured of its contexts; None before, and without a checkpoint.
+        behavior_seed: root seed of the dataset; None where none is known.
+        commit: of this package's code, with `-dirty` where files were changed since; None where the code was
+            no git checkout.
+        processor: model name of what trained, a processor or a graphics card.
     """
 
     schema_version: Literal[1] = 1
@@ -159,6 +163,9 @@ class RunResult(_Record):
     tuned: Tuned | None = None
     training_of: str | None = None
     contexts: ContextMeasures | None = None
+    behavior_seed: int | None = None
+    commit: str | None = None
+    processor: str | None = None
 
     @property
     def pair(self) -> tuple[int, int | None]:

@@ -16,16 +16,15 @@ from tcmrl_algo.reporting.tables import Table
 
 NOTE = """\
 Returns are undiscounted sums of rewards after adaptation, averaged over the test tasks. Intervals are 95% \
-bootstrap intervals of the mean over runs; with fewer than five runs, the values of all are printed. The \
-column `interval covers` says over what they are taken. Seeds of one split share the dataset, the split and \
-the test tasks: their interval shows the variance of training, and nothing of other tasks or data; that of \
-five seeds contains the true mean in about 84% of cases. With folds, every task of the dataset is a test \
-task once, and the interval is over all pairs of seed and fold: it covers training on these splits, not \
-tasks beyond the dataset. `other context` is the \
-return of the same policy with the contexts of other tasks; the regret is the oracle's return minus the \
-policy's; `best fixed` is the return of the best policy that acts the same in all tasks, fitted on the \
-training tasks; the normalized score is 0 for uniform actions and 1 for the oracle or, without one, for the \
-best behavior policy. A `(privileged)` method is a control that observes the task parameters."""
+intervals of the mean over runs by Student's t; with fewer than five runs, the values of all are printed. \
+The column `interval covers` says over what they are taken. Seeds of one split share the dataset, the split \
+and the test tasks: their interval shows the variance of training, and nothing of other tasks or data. \
+With folds, every task of the dataset is a test task once, and the interval is over all pairs of seed and \
+fold: it covers training on these splits, not tasks beyond the dataset. `other context` is the return of the \
+same policy with the contexts of other tasks; the regret is the oracle's return minus the policy's; `best \
+fixed` is the return of the best policy that acts the same in all tasks, fitted on the training tasks; the \
+normalized score is 0 for uniform actions and 1 for the oracle or, without one, for the best behavior \
+policy. A `(privileged)` method is a control that observes the task parameters."""
 CLAIMS = """\
 Differences are taken run by run (same seed, same fold), and positive differences support the claim, which \
 is judged under every protocol that it concerns. The 95% interval of the mean difference is by Student's t, \

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tcmrl_algo.experiment.aggregate import summarize
+from tcmrl_algo.experiment.aggregate import mean_interval, summarize
 from tcmrl_algo.experiment.results import RunResult, by_method
 from tcmrl_algo.reporting.contexts import FloatArray, IntArray, TransitionWeights
 
@@ -22,21 +22,39 @@ def draw_curves(file: Path, title: str, results: Sequence[RunResult], protocol: 
     """Mean returns of the test tasks during training; intervals from five seeds on, else a line per seed."""
     figure, (axes,) = _panels(1, width=1.5 * WIDTH)
     for index, (method, runs) in enumerate(by_method(results).items()):
-        color = f"C{index % 10}"
         steps = [point.step for point in runs[0].curve]
-        finals = [[point.final for point in run.curve] for run in runs]
-        points = [summarize(values) for values in zip(*finals, strict=True)]
-        axes.plot(steps, [point.mean for point in points], "o-", color=color, label=method, markersize=3)
-        lows, highs = [point.low for point in points], [point.high for point in points]
-        if None not in lows:
-            axes.fill_between(steps, lows, highs, color=color, alpha=0.2, linewidth=0)  # type: ignore[arg-type]
-        else:
-            for run in runs:
-                axes.plot(steps, [point.final for point in run.curve], color=color, alpha=0.4, linewidth=0.8)
+        _draw_curve(axes, index, method, steps, [[point.final for point in run.curve] for run in runs])
     _draw_references(axes, results[0])
     axes.set(xlabel="training steps", ylabel=f"return on test tasks ({protocol})", title=title)
     axes.legend(fontsize="small")
     figure.savefig(file, dpi=130)
+
+
+def draw_method_curves(
+    file: Path, title: str, curves: Mapping[str, Mapping[int, Sequence[float]]], protocol: str
+) -> None:
+    """The same of returns by method and step, one per run."""
+    figure, (axes,) = _panels(1, width=1.5 * WIDTH)
+    for index, (method, points) in enumerate(curves.items()):
+        runs = [list(run) for run in zip(*points.values(), strict=True)]
+        _draw_curve(axes, index, method, list(points), runs)
+    axes.set(xlabel="training steps", ylabel=f"return on test tasks ({protocol})", title=title)
+    axes.legend(fontsize="small")
+    figure.savefig(file, dpi=100)
+
+
+def _draw_curve(
+    axes: "Axes", index: int, label: str, steps: Sequence[int], runs: Sequence[Sequence[float]]
+) -> None:
+    color = f"C{index % 10}"
+    points = [summarize(values) for values in zip(*runs, strict=True)]
+    axes.plot(steps, [point.mean for point in points], "o-", color=color, label=label, markersize=3)
+    lows, highs = [point.low for point in points], [point.high for point in points]
+    if None not in lows:
+        axes.fill_between(steps, lows, highs, color=color, alpha=0.2, linewidth=0)  # type: ignore[arg-type]
+    else:
+        for run in runs:
+            axes.plot(steps, run, color=color, alpha=0.4, linewidth=0.8)
 
 
 def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
@@ -57,32 +75,29 @@ def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
     figure.savefig(file, dpi=130)
 
 
-def draw_boards(file: Path, boards: Mapping[str, Mapping[str, Mapping[str, Sequence[float]]]]) -> None:
-    """Mean returns with intervals, a panel per dataset, a line per method and a color per protocol.
+def draw_board(file: Path, title: str, board: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
+    """Mean returns with intervals, a line per method and a color per protocol.
 
     Args:
         file: the PNG file.
-        boards: returns of the runs by title, protocol and method.
+        title: of the panel.
+        board: returns of the runs by protocol and method.
     """
-    most = max(len({method for found in board.values() for method in found}) for board in boards.values())
-    figure, panels = _panels(len(boards), height=max(HEIGHT, 0.35 * most + 1.0))
-    for axes, (title, board) in zip(panels, boards.items(), strict=True):
-        methods = list(dict.fromkeys(method for found in board.values() for method in found))[::-1]
-        for index, (protocol, found) in enumerate(board.items()):
-            color, shift = f"C{index % 10}", 0.6 * (0.5 - (index + 0.5) / len(board))
-            for method, finals in found.items():
-                summary, place = summarize(finals), methods.index(method) + shift
-                axes.plot(summary.mean, place, "o", color=color, markersize=4)
-                low, high = summary.low, summary.high
-                if low is None or high is None:
-                    low, high = min(finals), max(finals)
-                axes.hlines(place, low, high, color=color, linewidth=1.2)
-            axes.plot([], [], "o-", color=color, label=protocol, markersize=4)
-        axes.set_yticks(range(len(methods)), methods, fontsize="small")
-        axes.set_xlabel("return on test tasks")
-        axes.set_title(title, fontsize="small")
-        axes.legend(fontsize="x-small")
-    figure.savefig(file, dpi=130)
+    methods = list(dict.fromkeys(method for found in board.values() for method in found))[::-1]
+    figure, (axes,) = _panels(1, width=1.5 * WIDTH, height=max(HEIGHT, 0.35 * len(methods) + 1.0))
+    for index, (protocol, found) in enumerate(board.items()):
+        color, shift = f"C{index % 10}", 0.6 * (0.5 - (index + 0.5) / len(board))
+        for method, finals in found.items():
+            place = methods.index(method) + shift
+            low, high = mean_interval(finals, fewest=2) or (finals[0], finals[0])
+            axes.plot(sum(finals) / len(finals), place, "o", color=color, markersize=4)
+            axes.hlines(place, low, high, color=color, linewidth=1.2)
+        axes.plot([], [], "o-", color=color, label=protocol, markersize=4)
+    axes.set_yticks(range(len(methods)), methods, fontsize="small")
+    axes.set_xlabel("return on test tasks")
+    axes.set_title(title, fontsize="small")
+    axes.legend(fontsize="x-small")
+    figure.savefig(file, dpi=100)
 
 
 def draw_adaptation(file: Path, title: str, results: Sequence[RunResult]) -> None:

@@ -12,6 +12,7 @@ from tcmrl_algo.reporting.claims import Verdict
 from tcmrl_algo.reporting.compose import Block, Page, Picture, compose
 from tcmrl_algo.reporting.html import page_html
 from tcmrl_algo.reporting.measuring import Measured, measure_source
+from tcmrl_algo.reporting.rows import add_rows
 from tcmrl_algo.reporting.sources import natural_order, read_sources
 from tcmrl_algo.reporting.tables import Table
 from tcmrl_data.foundation.disk import make_folders, replace_file
@@ -44,6 +45,7 @@ def write_report(
     out: str | Path,
     *,
     datasets: Sequence[str | Path] = (),
+    rows: str | Path | None = None,
     report: ReportProgress = ignore,
 ) -> WrittenReport:
     """Writes a report on results folders of experiments, on run folders, and on earlier reports.
@@ -55,16 +57,20 @@ def write_report(
         paths: the folders; all run folders are in one section.
         out: folder of the report, created if needed; files of an earlier report are replaced.
         datasets: folders of datasets that were moved after the training of the runs.
+        rows: a table, `runs.csv`, to which the runs of results folders are added.
         report: called with the name of a stage, the amount done and the total amount.
 
     Raises:
-        CheckpointError: not a results or run folder, no finished run in it, or a dataset of no run.
+        CheckpointError: not a results or run folder, no finished run in it, a dataset of no run, or `rows`
+            is no table.
 
     Example:
-        >>> write_report(["results/figure5"], "docs/results/figure5").verdicts  # doctest: +SKIP
+        >>> write_report(["results/figure5"], "reports/figure5").verdicts  # doctest: +SKIP
     """
     out = Path(out)
     measured = measure_paths(paths, datasets=datasets, report=report)
+    if rows is not None:
+        add_rows(Path(rows), [found for _, found in measured])
     page, judged = compose(measured, out)
     make_folders(out)
     records = [

@@ -1,38 +1,40 @@
 """The settings that tuning found, for the methods of an experiment."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from tcmrl_algo.experiment.config import Experiment
 from tcmrl_algo.experiment.results import Tuned
 from tcmrl_algo.methods.base import METHODS
-from tcmrl_algo.tuning.record import RECORD, Tuning, read_tuning
 from tcmrl_algo.tuning.space import searched
+from tcmrl_algo.tuning.table import TrialRow, best_settings, read_trials
 from tcmrl_data import TrainingError
 
 
 def tuned_settings(
-    experiment: Experiment, folder: str | Path, *, environments: Sequence[str] = (), only: Sequence[str] = ()
+    experiment: Experiment, place: str | Path, *, environments: Sequence[str] = (), only: Sequence[str] = ()
 ) -> dict[str, dict[str, Tuned]]:
     """The best settings of every environment and algorithm of an experiment.
 
     Args:
         experiment: whose environments may name the environment of which the settings are.
-        folder: of tunings, each in `ENV-ALGO`, where `tcmrl tune` puts it.
+        place: folder of tunings, each in `ENV-ALGO`, where `tcmrl tune` puts it; or a table of them.
         environments: those that are wanted; all where empty.
         only: labels of the methods that must be tuned; all where empty. Of others, those that exist are read.
             A method of which the experiment itself sets all that is searched need not be tuned.
 
     Raises:
+        CheckpointError: a record or the table is damaged.
         TrainingError: a method was not tuned, no trial of it ended well, or methods of an environment were
             tuned with unequal effort.
     """
+    trials = read_trials(Path(place))
     found = {
         environment: {
-            algorithm: _tuned(place, algorithm)
+            algorithm: _tuned(trials, name, place, algorithm)
             for algorithm in sorted({method.algorithm for method in experiment.methods.values()})
-            for place in [Path(folder) / f"{choice.tuning or environment}-{algorithm}"]
-            if algorithm in wanted or (place / RECORD).is_file()
+            for name in [f"{choice.tuning or environment}-{algorithm}"]
+            if algorithm in wanted or name in trials
         }
         for environment, choice in experiment.environments.items()
         if not environments or environment in environments
@@ -44,7 +46,7 @@ def tuned_settings(
             first, expected = efforts[0]
             if effort != expected:
                 raise TrainingError(
-                    f"{folder}: {first} was tuned for {environment} by {_effort(settings[first])}, {name} by "
+                    f"{place}: {first} was tuned for {environment} by {_effort(settings[first])}, {name} by "
                     f"{_effort(settings[name])}; tune methods with equal effort to compare them"
                 )
     return found
@@ -60,29 +62,17 @@ def _open_to_search(experiment: Experiment, environment: str, only: Sequence[str
     }
 
 
-def _tuned(folder: Path, algorithm: str) -> Tuned:
-    if not (folder / RECORD).is_file():
+def _tuned(trials: Mapping[str, Sequence[TrialRow]], name: str, place: str | Path, algorithm: str) -> Tuned:
+    if name not in trials:
+        folder = "tuning" if Path(place).is_file() else place
         raise TrainingError(
-            f"{folder} holds no tuning; `tcmrl tune --algo {algorithm} --out {folder}` makes one"
+            f"{place}: {name} holds no tuning; `tcmrl tune --algo {algorithm} --out {folder}/{name}` "
+            "makes one"
         )
-    tuning = read_tuning(folder)
-    best = tuning.best_trial
-    if best is None or best.score is None:
-        raise TrainingError(f"{folder}: no trial ended well")
-    return Tuned(
-        environment=tuning.environment,
-        root=tuning.root,
-        profile=tuning.profile,
-        trials=_num_ended(tuning),
-        steps=tuning.steps,
-        seeds=tuning.seeds,
-        score=best.score,
-        overrides=best.overrides,
-    )
-
-
-def _num_ended(tuning: Tuning) -> int:
-    return sum(trial.is_done for trial in tuning.trials)
+    found = best_settings(trials[name])
+    if found is None:
+        raise TrainingError(f"{place}, {name}: no trial ended well")
+    return found
 
 
 def _effort(tuned: Tuned) -> str:

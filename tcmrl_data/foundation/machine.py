@@ -1,11 +1,20 @@
-"""Cores and memory available to this process, limited by its CPU affinity and its control groups."""
+"""The processor, and the cores and memory that affinity and control groups leave to this process."""
 
 import os
+import platform
 from collections.abc import Iterator
 from pathlib import Path
 
 CGROUPS = Path("/sys/fs/cgroup")
 OWN_CGROUPS = Path("/proc/self/cgroup")
+CPU_INFO = Path("/proc/cpuinfo")
+
+
+def processor() -> str:
+    """Model name of the processor; `unknown` where the system tells none."""
+    lines = CPU_INFO.read_text().splitlines() if CPU_INFO.is_file() else []
+    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return models[0] if models else platform.processor() or "unknown"
 
 
 def available_cores() -> int:

@@ -5,7 +5,6 @@ import os
 import platform
 from collections.abc import Iterator, Mapping
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any, final
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment
 from tcmrl_data.foundation.canonical import digest
+from tcmrl_data.foundation.machine import processor
 from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.records import Record
 
@@ -28,7 +28,6 @@ VARIABLES = (
 )
 """Environment variables that choose the code of libraries which do not report their choice."""
 
-CPU_INFO = Path("/proc/cpuinfo")
 TEXT_LENGTH = 200
 
 
@@ -104,7 +103,7 @@ def _machine() -> dict[str, Any]:
 
     libc = " ".join(filter(None, platform.libc_ver()))
     return {
-        "cpu": _text(_cpu_model()),
+        "cpu": _text(processor()),
         "system": _text(f"{platform.machine()} {platform.system()}, {libc or 'unknown C library'}"),
         "python": platform.python_version(),
         "instructions": {
@@ -127,12 +126,6 @@ def _packages(environment: Environment, behavior: str | None) -> dict[str, str]:
     providers += [BEHAVIOR_SOURCES.provider(behavior)] if behavior else []
     foreign = {name for name in providers if name not in (None, "tcmrl")}
     return {name: _text(version(name)) for name in sorted({*PACKAGES, *foreign})}
-
-
-def _cpu_model() -> str:
-    lines = CPU_INFO.read_text().splitlines() if CPU_INFO.is_file() else []
-    models = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return models[0] if models else platform.processor() or "unknown"
 
 
 def _text(value: str) -> str:

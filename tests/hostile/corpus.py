@@ -7,7 +7,8 @@ from tests.hostile.policies import POLICIES
 from tests.hostile.records import ARCHIVES, RECORDS
 from tests.hostile.tables import PART_TABLES, PLACES, TASK_TABLES
 
-CASES = [
-    *(*MANIFESTS, *TASK_TABLES, *PART_TABLES, *PLACES, *RECORDS),
-    *(*ARCHIVES, *LAYOUTS, *CHUNKS, *POLICIES, *FILES),
-]
+CORPUS = (
+    *(MANIFESTS, TASK_TABLES, PART_TABLES, PLACES, RECORDS),
+    *(ARCHIVES, LAYOUTS, CHUNKS, POLICIES, FILES),
+)
+CASES = [case for cases in CORPUS for case in cases]

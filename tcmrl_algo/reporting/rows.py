@@ -1,0 +1,367 @@
+"""Results as rows of tables: `runs.csv`, and beside it `curves.csv`, `tuning.csv` and `worth.csv`.
+
+The table outlives results folders: a row holds what comparisons need, and names data, settings and code.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tcmrl_algo.experiment.compact import compact
+from tcmrl_algo.experiment.flat import Row, merged, read_table, write_table
+from tcmrl_algo.experiment.results import ContextMeasures, RunResult, success_rate
+from tcmrl_algo.reporting.measuring import Measured
+from tcmrl_algo.reporting.returns import DatasetReturns
+from tcmrl_algo.settings.run import LOGGING_KEYS
+from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.training.config import stage_plan
+from tcmrl_algo.tuning.record import read_tuning
+from tcmrl_algo.tuning.table import TrialRow, trial_rows
+from tcmrl_data import CheckpointError, Worth
+from tcmrl_data.foundation.canonical import digest
+from tcmrl_data.foundation.records import read_record
+
+RUNS, CURVES, WORTH = "runs.csv", "curves.csv", "worth.csv"
+HEX_DIGITS = 16
+"""Of roots and digests."""
+UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """A run under one protocol. Returns and scores are means over the test tasks.
+
+    Attributes:
+        experiment: name of its results folder.
+        environment: name of the environment.
+        dataset_profile: the profile that the dataset was built with.
+        behavior_seed: root seed of the dataset.
+        root: of the dataset, the first 16 digits. Only rows of one root compare.
+        profile: whose training table was the start.
+        method: label.
+        algorithm: name of the method in code.
+        privileged: whether the method observes the task parameters.
+        actor_critic: what trains the policy: `sac`, `sac+brac`, `sac+cloning`, or `own`.
+        snapshots: which snapshots transitions come from: `all`, `last` or a condition.
+        context_snapshots: the same of contexts, where it differs.
+        tuned: trials and steps of the search for the settings, and where.
+        seed, fold: of the run; no fold where the dataset's own split was used.
+        protocol: of evaluation.
+        test_tasks: their number.
+        final: return after adaptation.
+        shuffled: return with the contexts of other tasks.
+        regret: oracle minus final.
+        normalized: 0 for uniform actions, 1 for the oracle or, without one, the best behavior policy.
+        success: share of successful final episodes.
+        random, oracle, behavior, fixed: returns of uniform actions, of a controller that knows the task, of
+            the best behavior policy of each task, and of the best policy that acts the same in all tasks.
+        stored: return of all stored episodes of the test tasks.
+        context_ratio, centroid_accuracy, attention_zero, attention_nonzero: of `ContextMeasures`.
+        steps, policy_steps: of training, and of those the ones that train the policy.
+        ms_per_step: milliseconds of training a step.
+        peak_mb: megabytes that the process held at most, or the tensors on a CUDA device.
+        digest: of all tensors, 16 digits.
+        settings: digest of everything that the method was told, 16 digits.
+        commit, processor: of `RunResult`.
+    """
+
+    experiment: str
+    environment: str
+    dataset_profile: str | None
+    behavior_seed: int | None
+    root: str
+    profile: str
+    method: str
+    algorithm: str
+    privileged: bool
+    actor_critic: str
+    snapshots: str
+    context_snapshots: str | None
+    tuned: str | None
+    seed: int
+    fold: int | None
+    protocol: str
+    test_tasks: int
+    final: float
+    shuffled: float | None
+    regret: float | None
+    normalized: float | None
+    success: float | None
+    random: float | None
+    oracle: float | None
+    behavior: float | None
+    fixed: float | None
+    stored: float | None
+    context_ratio: float | None
+    centroid_accuracy: float | None
+    attention_zero: float | None
+    attention_nonzero: float | None
+    steps: int
+    policy_steps: int
+    ms_per_step: float | None
+    peak_mb: float | None
+    digest: str
+    settings: str
+    commit: str
+    processor: str
+
+    @property
+    def pair(self) -> tuple[str, int | None, int]:
+        """Data, fold and seed, by which runs of two methods are compared."""
+        return self.root, self.fold, self.seed
+
+
+@dataclass(frozen=True)
+class CurveRow:
+    """A point of a run's learning curve, under the experiment's first protocol."""
+
+    experiment: str
+    environment: str
+    root: str
+    method: str
+    seed: int
+    fold: int | None
+    protocol: str
+    step: int
+    final: float
+    shuffled: float
+
+
+@dataclass(frozen=True)
+class WorthRow:
+    """What `inspect worth` says of one split of a dataset.
+
+    Attributes:
+        dataset: name of the file that it came from.
+        environment, root: which dataset.
+        split: `train` or `test`.
+        tasks: number of tasks that took part.
+        own, single, uniform, best: returns of the tasks' own last policies, of the best single policy, of
+            uniform actions, and the best that is known.
+        worth, low, high: what a context can gain, as a share, with its 95% bootstrap interval over tasks.
+        rewarded_first, …: share of rewarded steps and visibility of the task, at the first and last stage.
+    """
+
+    dataset: str
+    environment: str
+    root: str
+    split: str
+    tasks: int
+    own: float
+    single: float
+    uniform: float | None
+    best: float
+    worth: float | None
+    low: float | None
+    high: float | None
+    rewarded_first: float | None
+    rewarded_last: float | None
+    reward_first: float | None
+    reward_last: float | None
+    dynamics_first: float | None
+    dynamics_last: float | None
+
+
+def add_rows(file: Path, measured: Iterable[Measured]) -> list[RunRow]:
+    """Puts the runs of results folders into a table, and their learning curves into `curves.csv` beside it.
+
+    A row takes the place of an earlier one of the same experiment, data, method, seed, fold and protocol.
+
+    Args:
+        file: the table; it is made if there is none.
+        measured: of results folders, whose names the experiments have in the table.
+
+    Returns:
+        The rows of these runs.
+
+    Raises:
+        CheckpointError: single runs, which have no experiment, or the table is not one.
+    """
+    rows: list[RunRow] = []
+    curves: list[CurveRow] = []
+    for found in measured:
+        source = found.source
+        folder = source.runs[0].folder.parents[1]
+        if not (folder / "experiment.json").is_file():
+            raise CheckpointError(
+                "single runs have no experiment; only results folders can be added to a table"
+            )
+        for run in source.runs:
+            result = run.result
+            rows += run_rows(folder.resolve().name, result, source.datasets.get(result.environment))
+            curves += curve_rows(folder.resolve().name, result, source.experiment.protocols[0])
+    _update(RunRow, file, rows, _run_key)
+    if curves:
+        _update(CurveRow, file.with_name(CURVES), curves, _curve_key)
+    return rows
+
+
+def add_tunings(file: Path, folders: Sequence[Path]) -> list[TrialRow]:
+    """Puts the trials of folders of `tcmrl tune` into a table, `tuning.csv`; the rows of these.
+
+    Raises:
+        CheckpointError: a folder holds no tuning, or `file` is no such table.
+    """
+    rows = [row for folder in folders for row in trial_rows(folder.resolve().name, read_tuning(folder))]
+    _update(TrialRow, file, rows, lambda row: (row.tuning, f"{row.trial:06}"))
+    return rows
+
+
+def add_worth(file: Path, documents: Sequence[Path]) -> list[WorthRow]:
+    """Puts documents of `inspect worth --json` into a table, `worth.csv`; the rows of these.
+
+    Raises:
+        CheckpointError: a document is none, or `file` is no such table.
+    """
+    rows = [row for document in documents for row in worth_rows(document.stem, read_record(Worth, document))]
+    _update(WorthRow, file, rows, lambda row: (row.dataset, row.split))
+    return rows
+
+
+def run_rows(experiment: str, result: RunResult, stored: DatasetReturns | None) -> list[RunRow]:
+    """Rows of a run, one per protocol.
+
+    Args:
+        experiment: its name in the table.
+        result: of the run.
+        stored: what is known of the dataset.
+    """
+    result = compact(result)
+    known = stored if stored is not None and stored.root == result.root else None
+    settings, tuned = result.config.settings, result.tuned
+    contexts = result.contexts or ContextMeasures(tasks=0)
+    other = settings.run.context_snapshots
+    seconds, memory = result.training_seconds, result.peak_memory
+    return [
+        RunRow(
+            experiment=experiment,
+            environment=result.environment,
+            dataset_profile=None if known is None else known.profile,
+            behavior_seed=result.behavior_seed,
+            root=result.root[:HEX_DIGITS],
+            profile=result.profile,
+            method=result.method,
+            algorithm=result.algorithm,
+            privileged=result.privileged,
+            actor_critic=actor_critic(settings, result.algorithm),
+            snapshots=str(settings.run.snapshots),
+            context_snapshots=None if other in (None, settings.run.snapshots) else str(other),
+            tuned=None if tuned is None else f"{tuned.trials} x {tuned.steps} on {tuned.environment}",
+            seed=result.seed,
+            fold=result.fold,
+            protocol=protocol,
+            test_tasks=len(evaluation["tasks"]),
+            final=evaluation["mean_final"],
+            shuffled=evaluation["mean_shuffled"],
+            regret=evaluation["mean_regret"],
+            normalized=evaluation["mean_normalized"],
+            success=success_rate(evaluation),
+            random=_mean(evaluation["tasks"], "random"),
+            oracle=_mean(evaluation["tasks"], "oracle"),
+            behavior=_mean(evaluation["tasks"], "behavior"),
+            fixed=_mean(evaluation["tasks"], "fixed"),
+            stored=None if known is None or result.fold is not None else known.test_return,
+            context_ratio=contexts.context_ratio,
+            centroid_accuracy=contexts.centroid_accuracy,
+            attention_zero=contexts.attention_zero,
+            attention_nonzero=contexts.attention_nonzero,
+            steps=result.steps,
+            policy_steps=tuple(stage_plan(result.config))[-1].steps,
+            ms_per_step=None if seconds is None else 1e3 * seconds / result.steps,
+            peak_mb=None if memory is None else memory / 1e6,
+            digest=result.digest[:HEX_DIGITS],
+            settings=settings_digest(result),
+            commit=result.commit or UNKNOWN,
+            processor=result.processor or UNKNOWN,
+        )
+        for protocol, evaluation in result.evaluations.items()
+    ]
+
+
+def curve_rows(experiment: str, result: RunResult, protocol: str) -> list[CurveRow]:
+    """The points of a learning curve; none of one that has its end alone."""
+    where = (
+        experiment,
+        result.environment,
+        result.root[:HEX_DIGITS],
+        result.method,
+        result.seed,
+        result.fold,
+    )
+    points = result.curve if len(result.curve) > 1 else ()
+    return [CurveRow(*where, protocol, point.step, point.final, point.shuffled) for point in points]
+
+
+def worth_rows(dataset: str, worth: Worth) -> list[WorthRow]:
+    """Rows of a document of `inspect worth --json`, one per split."""
+    rows = []
+    for split in worth.splits:
+        stages = [stage for stage in worth.stages if stage.split == split.split]
+        first, last = (stages[0], stages[-1]) if stages else (None, None)
+        rows.append(
+            WorthRow(
+                dataset=dataset,
+                environment=worth.environment,
+                root=worth.root[:HEX_DIGITS],
+                split=split.split,
+                tasks=split.tasks,
+                own=split.own,
+                single=split.single,
+                uniform=split.uniform,
+                best=split.best,
+                worth=split.worth,
+                low=split.low,
+                high=split.high,
+                rewarded_first=first.rewarded if first else None,
+                rewarded_last=last.rewarded if last else None,
+                reward_first=first.reward if first else None,
+                reward_last=last.reward if last else None,
+                dynamics_first=first.dynamics if first else None,
+                dynamics_last=last.dynamics if last else None,
+            )
+        )
+    return rows
+
+
+def actor_critic(settings: TrainingSettings, algorithm: str) -> str:
+    """What trains the policy of a run, as the table says it."""
+    if algorithm == "macaw":
+        return "own"
+    regularized = settings.actor_critic.brac.mode != "off"
+    return f"sac{'+brac' * regularized}{'+cloning' * (settings.actor_critic.cloning > 0)}"
+
+
+def settings_digest(result: RunResult) -> str:
+    """Digest of all settings but seed, threads and those that change no result."""
+    config = result.config.model_dump(mode="json")
+    for key in (*LOGGING_KEYS, "threads", "protocol"):
+        config["settings"]["run"].pop(key, None)
+    return digest([config, result.steps])[:HEX_DIGITS]
+
+
+def _mean(tasks: Sequence[dict[str, Any]], name: str) -> float | None:
+    values = [task.get(name) for task in tasks]
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known and len(known) == len(values) else None
+
+
+def _update(kind: type[Row], file: Path, rows: Iterable[Row], key: Callable[[Row], Any]) -> None:
+    write_table(kind, file, merged(read_table(kind, file) if file.exists() else [], rows, key))
+
+
+def _run_key(row: RunRow) -> tuple[str, ...]:
+    return (
+        row.experiment,
+        row.environment,
+        row.root,
+        row.method,
+        f"{row.seed:06}",
+        str(row.fold),
+        row.protocol,
+    )
+
+
+def _curve_key(row: CurveRow) -> tuple[str, ...]:
+    run = (row.experiment, row.environment, row.root, row.method, f"{row.seed:06}", str(row.fold))
+    return *run, f"{row.step:09}"
