@@ -1,5 +1,6 @@
 """Datasets of an experiment: missing ones, other profiles, and folds of the tasks."""
 
+import functools
 import json
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,7 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import load_experiment, run_experiment, write_report
+from tcmrl_algo.experiment import datasets
 from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.datasets import missing_datasets
 from tcmrl_algo.experiment.planning import plan_runs
@@ -17,6 +19,7 @@ from tcmrl_data import SelectionError, TrainingError
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
+from tests.conftest import TINY
 
 pytestmark = pytest.mark.usefixtures("in_process")
 
@@ -122,7 +125,11 @@ def test_an_experiment_with_folds_is_run_continued_and_reported(tiny_folder: Pat
 
 
 @pytest.mark.check
-def test_build_makes_what_is_missing_and_then_runs(tmp_path: Path, call: Call) -> None:
+def test_build_makes_what_is_missing_and_then_runs(
+    tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the recipe of the profile, but for fewer steps and episodes."""
+    monkeypatch.setattr(datasets, "load_recipe", functools.partial(tcmrl_data.load_recipe, overrides=TINY))
     content = experiments.tables(tmp_path / "data", seeds=[0], claims=[])
     content["methods"] = {"A": {"algorithm": "no_context"}}
     file = experiments.write_file(tmp_path / "small.toml", content)
