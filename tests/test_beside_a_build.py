@@ -30,6 +30,7 @@ def in_child(work: Callable[[], object]) -> int:
         os._exit(status)
 
 
+@pytest.mark.check
 def test_a_verification_beside_a_build_reports_nothing_false(
     tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -53,6 +54,7 @@ def test_a_verification_beside_a_build_reports_nothing_false(
     assert len(sizes) > 1, "no verification ran beside a build"
 
 
+@pytest.mark.check
 def test_asking_for_the_status_never_makes_a_build_fail(
     tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -74,6 +76,7 @@ def test_asking_for_the_status_never_makes_a_build_fail(
             os.waitpid(asker, 0)
 
 
+@pytest.mark.check
 def test_a_build_that_begins_and_ends_during_a_verification_gives_no_finding(
     tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

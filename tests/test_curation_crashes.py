@@ -127,6 +127,7 @@ def logged(name: str, sources: Sources, out: Path) -> list[Operation]:
     return recorder.log
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("name", COMMANDS)
 @pytest.mark.parametrize("fault", FAULTS)
 def test_the_same_command_recovers_from_a_fault_at_any_operation(
@@ -145,6 +146,7 @@ def test_the_same_command_recovers_from_a_fault_at_any_operation(
         shutil.rmtree(out.parent)
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_power_cut_leaves_the_dataset_before_or_after(
     sources: Sources, memory: Path, name: str, sweep: int

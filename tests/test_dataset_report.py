@@ -170,6 +170,7 @@ def test_without_named_columns_the_plane_keeps_most_variance(
     assert (states < plane.high).all()
 
 
+@pytest.mark.check
 def test_of_many_tasks_some_are_drawn(
     content: Content, tiny: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -186,6 +187,7 @@ def test_of_many_tasks_some_are_drawn(
     assert evenly([1, 2, 3], 9) == (1, 2, 3)
 
 
+@pytest.mark.check
 def test_a_hostile_label_stays_text(tiny_copy: Callable[[], Path], tmp_path: Path) -> None:
     folder = tiny_copy()
     tcmrl_data.rename_dataset(folder, HOSTILE)
@@ -224,6 +226,7 @@ def test_a_damaged_part_and_an_empty_dataset_are_refused(
     assert_refused(call("report", tmp_path), "does not exist")
 
 
+@pytest.mark.check
 def test_policies_in_other_tasks_and_pictures_are_shown_if_asked_for(tiny: Dataset, page: str) -> None:
     found = measure(tiny, browsed=1, transfer=True, strips=2, progress=lambda stage, done, total: None)
     assert found.transfer == tcmrl_data.measure_transfer(tiny)

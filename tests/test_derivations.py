@@ -27,6 +27,7 @@ def problems(folder: Path, *sources: Dataset) -> list[str]:
     return [f"{finding.file}: {finding.problem}" for finding in report.findings]
 
 
+@pytest.mark.check
 def test_sound_derivations_come_out_again(seeds: list[Dataset], tmp_path: Path) -> None:
     first, second = seeds
     derive_dataset(first, tmp_path / "tier", tier="medium-expert", split="train")

@@ -109,6 +109,7 @@ def staged(out: Path) -> list[str]:
     return sorted(path.name for path in (out / STAGING).iterdir())
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("workers", [1, 4])
 def test_digests_do_not_depend_on_workers_or_order(
     engine: EngineCase, workers: int, tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
@@ -123,6 +124,7 @@ def test_digests_do_not_depend_on_workers_or_order(
     assert all(result.ok and result.attempt == 1 and result.error is None for result in results.values())
 
 
+@pytest.mark.check
 def test_a_killed_worker_is_replaced_and_the_data_are_the_same(
     engine: EngineCase,
     tiny_folder: Path,
@@ -168,6 +170,7 @@ def test_a_unit_out_of_time_is_ended_and_tried_once_more(
     assert worker_pids(engine.mark) == []
 
 
+@pytest.mark.check
 def test_a_crash_is_told_in_the_words_of_the_worker(
     engine: EngineCase, tiny: Dataset, tmp_path: Path
 ) -> None:
@@ -181,6 +184,7 @@ def test_a_crash_is_told_in_the_words_of_the_worker(
     assert "memory" in str(result.error)
 
 
+@pytest.mark.check
 def test_a_unit_run_twice_at_once_makes_its_data_once(
     engine: EngineCase, tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
 ) -> None:
@@ -239,6 +243,7 @@ def test_an_interrupted_build_ends_its_workers_and_says_how_to_go_on(
     assert part_ids(out).keys() <= published  # the last of them may not have been told to the driver
 
 
+@pytest.mark.check
 def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
     engine: EngineCase, tiny_folder: Path, directions: Directions, tmp_path: Path
 ) -> None:
@@ -268,6 +273,7 @@ def test_a_worker_ends_with_its_driver(long_recipe: Recipe, tmp_path: Path) -> N
     assert not has_part(tmp_path / "data", 40, 100_000)
 
 
+@pytest.mark.check
 def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_done(
     tiny: Dataset, tiny_recipe: Recipe, directions: Directions, tmp_path: Path
 ) -> None:

@@ -89,6 +89,7 @@ def test_steps_are_recorded_at_most_once_a_second_but_all_are_reported(
     assert recorded == [0, 10, 20, 30, 40]
 
 
+@pytest.mark.check
 def test_status_of_a_running_build_from_another_process(tmp_path: Path) -> None:
     out, directions = tmp_path / "running", Directions(str(tmp_path / "directions")).hold()
     options = ["--profile", "quick", "--tasks", "0,3", "--workers", "1", "--quiet", "--out", str(out)]

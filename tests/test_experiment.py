@@ -313,9 +313,8 @@ def test_what_never_began_takes_a_new_device_and_new_threads(
         job.parent.with_name(f"{job.parent.name}.json").unlink()
 
 
-@pytest.mark.parametrize(
-    "end", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=pytest.mark.check)], ids=str
-)
+@pytest.mark.check
+@pytest.mark.parametrize("end", [signal.SIGINT, signal.SIGKILL], ids=str)
 def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
     end: signal.Signals, tiny_folder: Path, tmp_path: Path
 ) -> None:

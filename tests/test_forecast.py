@@ -1,7 +1,10 @@
+import pytest
+
 import tcmrl_data
 from tests.conftest import TINY
 
 
+@pytest.mark.check
 def test_a_forecast_counts_what_a_build_makes() -> None:
     recipe = tcmrl_data.load_recipe("point-robot", profile="quick", overrides=TINY)
     plan = tcmrl_data.plan_build(recipe, tasks=[0, 3, 4])

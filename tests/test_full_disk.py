@@ -38,6 +38,7 @@ def assert_one_line(result: "subprocess.CompletedProcess[str]", *expected: str) 
     assert all(text in lines[0] for text in expected), lines
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("name", FILES)
 def test_an_export_to_a_full_disk_names_the_file_and_leaves_nothing(
     name: str, tiny_folder: Path, tmp_path: Path
@@ -52,6 +53,7 @@ def test_an_export_to_a_full_disk_names_the_file_and_leaves_nothing(
     assert result.stdout == ""
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("name", [name for name in FILES if name != "idaq-npy"])  # whose files are small
 def test_an_export_under_a_limit_of_file_sizes_names_the_file(
     name: str, tiny_folder: Path, tmp_path: Path
@@ -69,6 +71,7 @@ def test_an_export_under_a_limit_of_file_sizes_names_the_file(
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.check
 def test_a_finished_dataset_that_is_read_only_needs_no_build_and_no_repair(tiny_folder: Path) -> None:
     built = run_mounted(
         read_only(tiny_folder), "build", *BUILD, "--tasks", TASK_LIST, "--out", tiny_folder, "--json"
@@ -81,6 +84,7 @@ def test_a_finished_dataset_that_is_read_only_needs_no_build_and_no_repair(tiny_
     assert "0 parts regenerated" in repaired.stdout and "cannot be written" in repaired.stdout
 
 
+@pytest.mark.check
 def test_a_read_only_dataset_that_lacks_parts_is_refused_by_name(tiny_copy: Callable[[], Path]) -> None:
     copy = tiny_copy()
     more = run_mounted(
@@ -94,6 +98,7 @@ def test_a_read_only_dataset_that_lacks_parts_is_refused_by_name(tiny_copy: Call
     assert damaged.stderr.startswith(f"Error: {copy} cannot be written") and damaged.stderr.count("\n") == 1
 
 
+@pytest.mark.check
 def test_a_build_without_room_says_sizes_in_fitting_units(
     tiny_recipe: tcmrl_data.Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -103,6 +108,7 @@ def test_a_build_without_room_says_sizes_in_fitting_units(
         tcmrl_data.build_dataset(tiny_recipe, tmp_path / "out", tasks=[0])
 
 
+@pytest.mark.check
 @pytest.mark.parametrize(
     ("num_bytes", "expected"),
     [(0, "0 B"), (999, "999 B"), (1_000, "1.0 kB"), (12_345_678, "12.3 MB"), (2e12, "2.0 TB")],
@@ -111,6 +117,7 @@ def test_a_size_has_the_unit_that_fits(num_bytes: float, expected: str) -> None:
     assert size(num_bytes) == expected
 
 
+@pytest.mark.check
 def test_a_cache_that_cannot_be_written_names_the_variable(
     tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -120,6 +127,7 @@ def test_a_cache_that_cannot_be_written_names_the_variable(
         cached_rows(tiny.select(split="train"))
 
 
+@pytest.mark.check
 def test_a_record_of_events_on_a_full_disk_is_named(tmp_path: Path) -> None:
     event = BuildEvent("start", None, 0, 1, 0, 3, 0, 450, "1 of 1 tasks to build")
     with EventLog(tmp_path, lambda event: None) as log:

@@ -260,6 +260,7 @@ def test_the_command(exported: list[Path], tmp_path: Path, capsys: pytest.Captur
     assert not (tmp_path / "other").exists()
 
 
+@pytest.mark.check
 def test_a_stopped_import_goes_on(exported: list[Path], tmp_path: Path) -> None:
     class Stop(Exception):
         pass

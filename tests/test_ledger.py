@@ -277,6 +277,7 @@ def test_a_dataset_at_a_limit_is_built_and_read_and_one_beyond_is_refused_before
     expect_whole(parts, tiny, tmp_path / "data")
 
 
+@pytest.mark.check
 def test_the_limits_of_tasks_and_of_parts_are_those_that_are_stated(tmp_path: Path) -> None:
     many = ("environment.tasks=100001", "environment.train=100000")
     with pytest.raises(BuildError, match="100,001 tasks, more than the 100,000 that"):

@@ -26,6 +26,7 @@ print(given_back, faults())
 """
 
 
+@pytest.mark.check
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="glibc's allocator alone can be told")
 def test_freed_tensors_are_asked_for_anew_without_page_faults() -> None:
     """Runs in a separate process, because the setting is permanent."""

@@ -68,10 +68,12 @@ EQUAL = Machine("equal", {})
 OTHER_CPU = {"ATEN_CPU_CAPABILITY": "default"}
 
 
+@pytest.mark.check
 def test_an_engine_of_one_machine_has_nothing_to_check(plan: BuildPlan, tmp_path: Path) -> None:
     assert check_nodes(LocalEngine(), plan, tmp_path / "data") == ()
 
 
+@pytest.mark.check
 def test_another_processor_is_told_and_not_refused(
     plan: BuildPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -83,6 +85,7 @@ def test_another_processor_is_told_and_not_refused(
     assert list((tmp_path / "data" / STAGING).iterdir()) == []
 
 
+@pytest.mark.check
 def test_other_versions_are_refused_by_machine_and_version(
     plan: BuildPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -98,6 +101,7 @@ def test_other_versions_are_refused_by_machine_and_version(
     assert "\n" not in told
 
 
+@pytest.mark.check
 def test_a_machine_without_the_shared_folder_is_named(
     plan: BuildPlan, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,6 +113,7 @@ def test_a_machine_without_the_shared_folder_is_named(
     assert list((out / STAGING).iterdir()) == []
 
 
+@pytest.mark.check
 def test_a_machine_that_lacks_a_package_is_named(plan: BuildPlan, tmp_path: Path) -> None:
     (tmp_path / "torch.py").write_text("raise ImportError('no torch')")
     bare = Machine("bare", {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])})

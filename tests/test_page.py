@@ -149,6 +149,7 @@ def test_rows_share_the_horizontal_axis() -> None:
     assert layout["xaxis"]["anchor"] == "y3"
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("text", ["name", HOSTILE])
 def test_pictures_are_the_same_every_time_and_take_any_text(text: str) -> None:
     made = figure(2, text)
@@ -157,6 +158,7 @@ def test_pictures_are_the_same_every_time_and_take_any_text(text: str) -> None:
     assert base64.b64decode(picture.partition(",")[2]).startswith(b"<?xml")
 
 
+@pytest.mark.check
 def test_a_picture_shows_some_frames_and_says_so() -> None:
     assert [frame.label for frame in shown_frames(figure(50))][:: PANELS - 1] == ["name 0", "name 49"]
     page = Page("title", is_interactive=False)

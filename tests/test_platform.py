@@ -30,6 +30,7 @@ def platform_of(**variables: str) -> Platform:
     return Platform.model_validate_json(done.stdout)
 
 
+@pytest.mark.check
 def test_two_processes_on_a_machine_have_the_same_platform() -> None:
     first, second = platform_of(), this_platform(environment_of("hopper-rand-params"), "stacked")
     assert first == second
@@ -39,6 +40,7 @@ def test_two_processes_on_a_machine_have_the_same_platform() -> None:
     }  # fmt: skip
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("variables", [AVX2, BASELINE, {"MKL_CBWR": "AVX2"}])
 def test_instruction_sets_and_variables_make_another_platform(variables: Mapping[str, str]) -> None:
     here = this_platform(environment_of("hopper-rand-params"), "stacked")

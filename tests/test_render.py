@@ -63,6 +63,7 @@ def changed(episode: StoredEpisode, name: str, step: int) -> StoredEpisode:
     return dataclasses.replace(episode, trajectory=dataclasses.replace(episode.trajectory, **{name: array}))
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("name", NAMES)
 def test_every_environment_gives_pictures_of_an_episode_that_comes_back(name: str) -> None:
     environment, episode = stored_episode(name)

@@ -99,6 +99,7 @@ def test_methods_may_have_different_numbers_of_contexts(tmp_path: Path) -> None:
     assert (tmp_path / "contexts.png").read_bytes().startswith(PNG)
 
 
+@pytest.mark.check
 def test_attention_is_relative_and_makes_the_context(trained: FinishedRun, tiny: Dataset) -> None:
     stored = Stored(tiny, "all")
     assert stored.labels.shape == (len(stored.lanes),)
@@ -198,6 +199,7 @@ def test_dataset_returns_are_those_of_its_parts(report: WrittenReport, tiny: Dat
     assert list(rows) == ["0", "100", "150", "all"]
 
 
+@pytest.mark.check
 def test_the_command_writes_reports_on_results_and_on_runs(results: Path, tmp_path: Path, call: Call) -> None:
     run = results / "runs/point-robot--tcmrl--seed0"
     code, output, _ = call("report", run, "--out", tmp_path / "runs", "--json", "--quiet")

@@ -63,6 +63,7 @@ def write(file: Path, data: bytes | None) -> None:
         file.write_bytes(data)
 
 
+@pytest.mark.check
 @pytest.mark.parametrize(
     "rounds",
     [9, pytest.param(89, marks=pytest.mark.exhaustive)],

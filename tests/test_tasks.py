@@ -55,6 +55,7 @@ def assert_equal_elsewhere(names: list[str], variables: dict[str, str]) -> None:
         assert elsewhere == here, name
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("platform", OTHER_PLATFORMS)
 def test_tasks_are_the_same_bits_on_every_instruction_set(platform: str) -> None:
     assert_equal_elsewhere(NAMES, OTHER_PLATFORMS[platform])
