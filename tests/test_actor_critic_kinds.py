@@ -1,12 +1,15 @@
 """`actor_critic.kind`: equations of `iql` and `bc`, what trains what, and that every method takes both."""
 
 import itertools
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
 import torch
+from tcmrl_cli.train import tcmrl
 from torch import Tensor
 
 from tcmrl_algo.actor_critic.actor_critic import ActorCritic, value_bounds
@@ -19,6 +22,7 @@ from tcmrl_algo.losses import actor_critic as losses
 from tcmrl_algo.methods.base import METHODS
 from tcmrl_algo.networks.policy import LIKELIHOOD_LOG_STD, LikelihoodPolicy
 from tcmrl_algo.settings.actor_critic import ActorCriticSettings
+from tests.commands import in_process
 from tests.made_up import ACTION_DIM, TASKS, problem, steps
 from tests.test_algorithms import LANES, STEPS, Made, act, assert_equal
 
@@ -308,3 +312,21 @@ def test_a_learner_of_any_kind_goes_on_from_its_tensors_at_every_step(name: str,
     )
     actions = act(straight.adapt(LANES))
     assert actions.shape == (2, ACTION_DIM) and abs(actions).max() <= 1
+
+
+@pytest.mark.parametrize("kind", NEW_KINDS)
+def test_a_run_of_any_kind_trains_and_is_evaluated(
+    kind: str, tiny_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By the command line, cloning the better half of the snapshots under contexts of all of them."""
+    call, out = in_process(tcmrl, capsys), tmp_path / "run"
+    chosen = (f"actor_critic.kind={kind}", "actor_critic.hidden=[8]", "batch.transitions=8", "run.steps=4")
+    snapshots = ("run.snapshots=return>=0.5", "run.context_snapshots=all", "run.log_every=1")
+    changes = [text for value in (*chosen, *snapshots) for text in ("--set", value)]
+    code, _, errors = call("train", tiny_folder, "--algo", "focal", "--json", "--out", out, *changes)
+    assert code == 0, errors
+    metrics = [json.loads(line) for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert ("loss/critic" in metrics[-1]) is (kind == "iql") and "loss/policy" in metrics[-1]
+    code, output, errors = call("evaluate", out, "--json", "--protocol", "offline")
+    assert code == 0, errors
+    assert "focal" in output
