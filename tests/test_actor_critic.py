@@ -6,9 +6,10 @@ from types import ModuleType
 import pytest
 import torch
 
-from tcmrl_algo.actor_critic import actor_critic as actor_critic_module
 from tcmrl_algo.actor_critic import brac as brac_module
-from tcmrl_algo.actor_critic.actor_critic import ActorCritic, value_bounds
+from tcmrl_algo.actor_critic import sac as sac_module
+from tcmrl_algo.actor_critic.actor_critic import value_bounds
+from tcmrl_algo.actor_critic.sac import SoftActorCritic
 from tcmrl_algo.settings.actor_critic import ActorCriticSettings
 from tests.made_up import TASKS, problem, steps
 
@@ -21,7 +22,7 @@ def test_value_bounds_are_geometric_sums_of_the_extreme_rewards() -> None:
 @pytest.mark.parametrize(("clip", "same"), [(True, True), (False, False)])
 def test_next_values_beyond_the_bounds_count_as_the_bound(clip: bool, same: bool) -> None:
     made = ActorCriticSettings(hidden=(8,), clip_targets=clip)
-    actor_critic = ActorCritic(made, problem(), latent=2, generator=torch.Generator().manual_seed(0))
+    actor_critic = SoftActorCritic(made, problem(), latent=2, generator=torch.Generator().manual_seed(0))
     rows = actor_critic.rows(steps(TASKS, 5, seed=1), torch.zeros(TASKS, 2))
     found = []
     for factor in (2.0, 3.0):
@@ -32,7 +33,7 @@ def test_next_values_beyond_the_bounds_count_as_the_bound(clip: bool, same: bool
 
 
 def test_each_loss_trains_its_own_network() -> None:
-    actor_critic = ActorCritic(
+    actor_critic = SoftActorCritic(
         ActorCriticSettings(hidden=(8,), mean_regularization=0.0, std_regularization=0.0),
         problem(),
         latent=2,
@@ -54,7 +55,7 @@ def test_each_loss_trains_its_own_network() -> None:
 
 def test_target_follows_by_tau() -> None:
     made = ActorCriticSettings(hidden=(8,), tau=0.25)
-    actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
+    actor_critic = SoftActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
         actor_critic.value.layers[-1].bias.fill_(4.0)
         actor_critic.target_value.layers[-1].bias.fill_(0.0)
@@ -65,7 +66,7 @@ def test_target_follows_by_tau() -> None:
 def test_dual_critic_tells_a_far_policy_from_behavior_and_alpha_rises() -> None:
     brac = {"mode": "policy", "alpha": 1.0, "learning_rate": 1e-2, "steps": 3, "penalty": 0.1}
     made = ActorCriticSettings.model_validate({"hidden": (16,), "brac": brac})
-    actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
+    actor_critic = SoftActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():  # the policy acts near (1, 1), the data near (0, 0)
         actor_critic.policy.perceptron.layers[-1].bias.copy_(torch.tensor([3.0, 3.0, -3.0, -3.0]))
     data = steps(TASKS, 50, seed=1)
@@ -92,12 +93,12 @@ def test_value_mode_lowers_each_states_target_by_its_own_divergence(monkeypatch:
 
         monkeypatch.setattr(module, name, call)
 
-    spy(actor_critic_module, "value_loss", 1)  # the targets of V
-    spy(actor_critic_module, "q_loss", 3)  # V(s'), as Q's targets see it
+    spy(sac_module, "value_loss", 1)  # the targets of V
+    spy(sac_module, "q_loss", 3)  # V(s'), as Q's targets see it
     spy(brac_module, "dual_divergence", -1)
     for mode in ("policy", "value"):
         made = ActorCriticSettings.model_validate({"hidden": (8,), "brac": {"mode": mode, "alpha": 7.0}})
-        actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
+        actor_critic = SoftActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
         with torch.no_grad():
             actor_critic.target_value.layers[-1].bias.fill_(-1e6)
         rows = actor_critic.rows(steps(TASKS, 5, seed=1), torch.zeros(TASKS, 0))
@@ -112,16 +113,16 @@ def test_value_mode_lowers_each_states_target_by_its_own_divergence(monkeypatch:
 
 def test_the_limit_of_q_is_a_multiple_of_what_rewards_allow() -> None:
     made = ActorCriticSettings(gamma=0.5, reward_scale=3.0, entropy=0.0, divergence_factor=10.0, hidden=(8,))
-    actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator())
+    actor_critic = SoftActorCritic(made, problem(), latent=0, generator=torch.Generator())
     assert actor_critic.limits() == pytest.approx({"actor_critic/largest_q": 120.0})  # 10 * max(12, 6)
     small = ActorCriticSettings(reward_scale=1e-9, entropy=0.0, divergence_factor=10.0, hidden=(8,))
-    limits = ActorCritic(small, problem(), latent=0, generator=torch.Generator()).limits()
+    limits = SoftActorCritic(small, problem(), latent=0, generator=torch.Generator()).limits()
     assert limits == {"actor_critic/largest_q": 10.0}
 
 
 def test_the_largest_q_is_that_of_any_critic_and_row() -> None:
     made = ActorCriticSettings(hidden=(8,))
-    actor_critic = ActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
+    actor_critic = SoftActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))
     rows = actor_critic.rows(steps(TASKS, 5, seed=1), torch.zeros(TASKS, 0))
     with torch.no_grad():
         actor_critic.critics.members[1].layers[-1].bias.fill_(-500.0)
@@ -132,7 +133,7 @@ def test_the_largest_q_is_that_of_any_critic_and_row() -> None:
 @pytest.mark.parametrize("critic_gradient", [False, True])
 def test_the_critics_gradient_reaches_contexts_only_where_asked(critic_gradient: bool) -> None:
     made = ActorCriticSettings.model_validate({"hidden": (8,), "brac": {"mode": "value"}})
-    actor_critic = ActorCritic(made, problem(), latent=2, generator=torch.Generator().manual_seed(0))
+    actor_critic = SoftActorCritic(made, problem(), latent=2, generator=torch.Generator().manual_seed(0))
     context = torch.ones(TASKS, 2, requires_grad=True)
     rows = actor_critic.rows(steps(TASKS, 5, seed=1), context, critic_gradient=critic_gradient)
     _, metrics = actor_critic.losses(rows, torch.Generator().manual_seed(0))
@@ -147,7 +148,7 @@ def test_the_critics_gradient_reaches_contexts_only_where_asked(critic_gradient:
 
 def test_a_context_of_every_step_stands_beside_its_step_and_padding_is_left_out() -> None:
     made = ActorCriticSettings(hidden=(8,))
-    actor_critic = ActorCritic(made, problem(), latent=1, generator=torch.Generator().manual_seed(0))
+    actor_critic = SoftActorCritic(made, problem(), latent=1, generator=torch.Generator().manual_seed(0))
     episodes = steps(TASKS, 2, 6, seed=1, lengths=(6, 4, 5))
     numbers = torch.arange(episodes.mask.numel()).view(*episodes.mask.shape, 1).float()
     rows = actor_critic.rows(episodes, numbers, numbers + 0.5)

@@ -7,8 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
+import tcmrl_data
+from tcmrl_algo import resolve
 from tcmrl_algo.algorithms import tcmrl
 from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLosses
+from tcmrl_algo.experiment.config import load_experiment
 from tcmrl_algo.losses import context as context_losses
 from tcmrl_algo.losses.context import task_contrastive_loss
 from tcmrl_algo.networks.perceptron import call_frozen
@@ -370,3 +373,14 @@ def test_switches_of_the_context_leave_the_actor_critics_draws_alone() -> None:
     noisy = method({"weights": weights | {"negative": 1e-30}})
     expected = first.update(batch(), 1)["loss/policy"]
     torch.testing.assert_close(noisy.update(batch(), 1)["loss/policy"], expected, rtol=0, atol=0)
+
+
+def test_sparse_rewards_are_estimated_by_trajectory_in_the_recipe_and_whatever_was_tuned_elsewhere() -> None:
+    """Appendix F.3; a search on dense rewards may have found `transition`, which equals `auto` there."""
+    recipe = tcmrl_data.load_recipe("sparse-point-robot", profile="quick")
+    assert recipe.environment.reward_density == "sparse"
+    for profile, table in recipe.training.items():
+        assert resolve(table, place=profile, algorithm="tcmrl").method["reward_estimation"] == "auto"
+    assert "tcmrl.reward_estimation" not in tcmrl.Tcmrl.search
+    chosen = load_experiment("table2").overrides("sparse-point-robot", "TCMRL")
+    assert 'tcmrl.reward_estimation="auto"' in chosen

@@ -10,6 +10,7 @@ from tcmrl_algo.algorithms import tcmrl as tcmrl_module
 from tcmrl_algo.settings.actor_critic import ActorCriticSettings
 from tcmrl_algo.settings.batch import BatchSettings
 from tcmrl_algo.settings.brac import BracSettings
+from tcmrl_algo.settings.iql import IqlSettings
 from tcmrl_algo.settings.optimizer import OptimizerSettings
 from tcmrl_algo.settings.run import RunSettings
 from tcmrl_algo.settings.training import TrainingSettings
@@ -75,6 +76,7 @@ def test_unknown_algorithm_names_the_nearest(tiny: Dataset) -> None:
         BatchSettings,
         ActorCriticSettings,
         BracSettings,
+        IqlSettings,
         tcmrl_module.TcmrlConfig,
         tcmrl_module.Weights,
     ],

@@ -331,7 +331,7 @@ def test_what_is_set_is_not_searched(tiny: Dataset, tmp_path: Path) -> None:
     assert space("csro") == [rate, entropy, *own]
     assert space("csro", f"{rate}=2e-3", f"{entropy} = 0.3") == own
     assert space("csro", "csro.epsilon=0.2", "csro.penalty=2.0") == [rate, entropy, "csro.distance_weight"]
-    assert space("tcmrl", "tcmrl.weights={distance=0.2}") == [rate, entropy, "tcmrl.reward_estimation"]
+    assert space("tcmrl", "tcmrl.weights={distance=0.2}") == [rate, entropy]
     both = (f"{rate}=2e-3", f"{entropy}=0.3")
     with pytest.raises(TrainingError, match="nothing is left to search of no_context"):
         tune_method(tiny, tmp_path / "out", algorithm="no_context", trials=1, overrides=both)

@@ -12,7 +12,7 @@ class ConditionedRows:
 
     Attributes:
         inputs: states and contexts, without gradient.
-        critic_inputs: the same for Q, where the critic's gradient may reach the contexts.
+        critic_inputs: the same for Q, whose gradient may reach the contexts; without Q, for the policy.
         next_inputs: next states and their contexts, without gradient.
         actions: in [-1, 1].
         rewards: scaled.

@@ -69,20 +69,24 @@ class TcmrlConfig(MethodConfig):
             orthogonality and L_neg, which shape attention alone, are left out. The paper's variant without
             extractor (Figure 5) has no L_pos either: that is `mean` and a weight of 0 for `positive`.
         reward_estimation: of a `transition` (Eq. 7 and 8) or of a whole `trajectory` (Eq. 17 and 18); `auto`
-            goes by the environment's reward density (paper, F.3). An execution trajectory is one target of a
+            goes by the environment's reward density (paper, F.3) and is not searched by `tcmrl tune`: where
+            rewards are dense it equals `transition`, and that choice, taken to another environment, would
+            undo it. An execution trajectory is one target of a
             `trajectory` and T targets of a `transition`; `batch.execution_trajectories` makes up for it.
         estimator_training: where the weight of `positive` is 0 and L_neg reads the estimator, `always` trains
             the estimator all the same, on detached contexts (published code), and `positive` leaves it at its
             random start (the paper's text: L_pos alone trains it).
         sparsity: of Eq. 6. `sigmoid` is our reading; `centered` takes the mean score off first, so that no
             bias satisfies it (ours); `entropy` is that of the weights (ours); `literal` is the printed form,
-            constant and without gradient.
+            constant and without gradient. `weights.sparsity = 0` leaves it out.
         reverse_scale: `mean` divides c_neg by T - 1 (ours), which brings it close to the mean context;
             `sum` leaves it as printed (see `losses.context.reverse_context`).
         negative_reward: how targets of L_neg are made wrong (paper, G.3: `random`). On average, `random`
             targets are the true rewards (see `losses.context.negative_reward_loss`).
         negative_noise: standard deviation of `random`, in standard deviations of the reward
             (published code: 0.5, of the raw reward).
+        negative_bias: mean of that noise, likewise (paper and published code: 0). Any other makes `random`
+            targets wrong on average: L_neg then teaches c_neg to predict rewards that lie that far off.
         temperature: of the contrastive loss (paper: none, 1).
         distance_examples: execution trajectories that the distance-metric loss takes as further examples of
             their task (ours), so that more of them for Eq. 17 change no other loss.
@@ -100,6 +104,7 @@ class TcmrlConfig(MethodConfig):
     reverse_scale: Literal["mean", "sum"] = "mean"
     negative_reward: losses.NegativeKind = "random"
     negative_noise: float = Field(default=0.5, ge=0)
+    negative_bias: float = 0.0
     temperature: float = Field(default=1.0, gt=0)
     distance_examples: int = Field(default=1, ge=1)
     weights: Weights = Weights()
@@ -202,8 +207,9 @@ class TcmrlLearner(ContextLearner):
             predicted = self.estimator(inputs, attention.context.detach())
             terms["estimator"] = positive(predicted.view(shape), rewards, mask)
         if has_negative:
-            scale = config.negative_noise / (self._horizon if whole else 1)
-            noise = scale * torch.randn(rewards.shape, generator=generator).to(rewards.device)
+            unit = self._horizon if whole else 1
+            draws = torch.randn(rewards.shape, generator=generator).to(rewards.device)
+            noise = config.negative_noise / unit * draws + config.negative_bias / unit
             wrong = losses.negative_rewards(rewards, mask, kind=config.negative_reward, noise=noise)
             reverse = losses.reverse_context(
                 attention.representations,
@@ -257,7 +263,6 @@ class Tcmrl(Method[TcmrlConfig]):
         "tcmrl.weights.sparsity": TRIED_WEIGHTS,
         "tcmrl.weights.contrastive": TRIED_WEIGHTS,
         "tcmrl.weights.distance": TRIED_WEIGHTS,
-        "tcmrl.reward_estimation": Options(("auto", "transition")),
     }
 
     def batch_request(self, settings: TrainingSettings, config: TcmrlConfig) -> BatchRequest:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from tcmrl_algo.actor_critic.actor_critic import ActorCritic
+from tcmrl_algo.actor_critic.kinds import make_actor_critic
 from tcmrl_algo.methods.base import Algorithm, Metrics
 from tcmrl_algo.methods.padding import pad_trajectories
 from tcmrl_algo.methods.problem import Problem
@@ -34,7 +35,8 @@ class ContextLosses:
             stage that does not train the actor-critic.
         metrics: the terms by name.
         next_context: of the next observations, where it differs from `context`.
-        critic_gradient: lets Q's loss train `context`; V, the policy and all targets see it detached.
+        critic_gradient: lets Q's loss train `context`; V, the policy and all targets see it detached. `bc`,
+            which has no Q, lets the policy's loss train it.
         steps: training data of the actor-critic; the batch's "policy" transitions if left out. Padding of
             trajectories (tasks, n, steps) is left out.
     """
@@ -105,7 +107,7 @@ class ContextAlgorithm(Algorithm):
     def __init__(self, problem: Problem, settings: TrainingSettings, *, learner: ContextLearner) -> None:
         self._problem = problem
         self.learner = learner.to(problem.device)
-        self.actor_critic = ActorCritic(
+        self.actor_critic = make_actor_critic(
             settings.actor_critic,
             problem,
             latent=learner.latent,

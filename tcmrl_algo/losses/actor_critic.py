@@ -3,10 +3,14 @@
 Q(s, a, c), V(s, c) and pi(a|s, c) are conditioned on a context c; rows are transitions of all tasks.
 """
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.nn import functional
+
+from tcmrl_algo.losses.advantage_regression import SMALLEST_STD
 
 Scalar = Float[Tensor, ""]
 
@@ -80,3 +84,50 @@ def gradient_penalty(gradients: Float[Tensor, "rows inputs"]) -> Scalar:
     """
     norms = (gradients.square().sum(dim=-1) + 1e-12).sqrt()
     return functional.relu(norms - 1.0).square().mean()
+
+
+def expectile_loss(
+    values: Float[Tensor, " rows"], targets: Float[Tensor, " rows"], *, expectile: float
+) -> Scalar:
+    """Mean |tau - 1(u < 0)| u^2 with u = min_k Q'_k(s, a, c) - V(s, c) (IQL, Kostrikov et al., 2021, eq. 5).
+
+    Args:
+        values: V(s, c).
+        targets: min Q' of the stored actions; no gradient reaches them.
+        expectile: tau; 1/2 gives half the squared error, more weighs targets above V more.
+    """
+    differences = targets.detach() - values
+    weights = torch.where(differences < 0, 1.0 - expectile, expectile)
+    return (weights * differences.square()).mean()
+
+
+def advantage_weights(
+    advantages: Float[Tensor, " rows"], *, inverse_temperature: float, largest: float
+) -> Float[Tensor, " rows"]:
+    """How much stored actions weigh: w = min(exp(beta A / std A), largest) (IQL, equation 7).
+
+    Deviation: the paper's advantages A = min_k Q'_k - V are in units of the reward; here they are divided by
+    their unbiased standard deviation over the rows. They are not centered. No gradient reaches them.
+    """
+    advantages = advantages.detach()
+    scaled = inverse_temperature * advantages / (advantages.std() + SMALLEST_STD)
+    return scaled.clamp(max=math.log(largest)).exp()
+
+
+def gaussian_log_likelihood(
+    actions: Float[Tensor, "rows action"],
+    means: Float[Tensor, "rows action"],
+    log_std: Float[Tensor, " action"],
+) -> Float[Tensor, " rows"]:
+    """Log density of N(mu, sigma^2): sum of -(a - mu)^2 / (2 sigma^2) - log sigma - log(2 pi) / 2.
+
+    No correction for a squashing: the density is that of actions themselves (published code of IQL), so that
+    actions at -1 and 1, whose inverse tanh is infinite, have a finite likelihood.
+    """
+    terms = -0.5 * ((actions - means) / log_std.exp()).square() - log_std - 0.5 * math.log(2 * math.pi)
+    return terms.sum(dim=-1)
+
+
+def likelihood_loss(log_likelihoods: Float[Tensor, " rows"], weights: Float[Tensor, " rows"]) -> Scalar:
+    """Mean of -w log pi(a | s, c) (IQL, equation 7); with weights of 1, behavior cloning."""
+    return -(weights.detach() * log_likelihoods).mean()

@@ -99,7 +99,8 @@ def negative_rewards(
 ) -> Float[Tensor, "*lanes steps"]:
     """Wrong targets for L_neg: r' + noise, or the trajectory's largest or smallest reward (Appendix G.3).
 
-    Noise of mean zero makes no target wrong on average (see `negative_reward_loss`); `max` and `min` do.
+    Noise of mean zero makes no target wrong on average (see `negative_reward_loss`); noise of another mean,
+    `max` and `min` do.
 
     Args:
         rewards: r'_t of execution trajectories.
@@ -136,6 +137,7 @@ def negative_reward_loss(
     With r_neg = r' + e and noise e of mean zero and variance v that is independent of r_hat,
     E (r_hat - r' - e)^2 = (r_hat - r')^2 + v: the expected loss is that of the true reward plus a constant,
     and so the expected gradient trains c_neg, too, to predict the true reward. The noise adds variance alone.
+    With noise of mean b the expected gradient is that of fitting r' + b.
     """
     return masked_mean((predicted - negative) ** 2, mask)
 
