@@ -73,6 +73,7 @@ class AntDir(Environment):
     observation_dim = 27
     action_dim = ACTION_DIM
     ordering_name = "direction (rad)"
+    is_circular = True
     simulator_bytes = 2 * 2**20
     settings: AntDirSettings
 
@@ -129,6 +130,7 @@ class AntGoal(Environment):
     observation_dim = 29
     action_dim = ACTION_DIM
     ordering_name = "goal angle (rad)"
+    is_circular = True
     plane = ("x", "y")
     simulator_bytes = 2 * 2**20
     settings: AntGoalSettings

@@ -125,6 +125,8 @@ class Environment(abc.ABC):
     """Dtypes of further per-step arrays, by name."""
     ordering_name: ClassVar[str | None] = None
     """What `ordering` measures, with its unit; None where tasks have no order."""
+    is_circular: ClassVar[bool] = False
+    """Whether `ordering` is a place on a circle, where the last task is beside the first."""
     plane: ClassVar[tuple[str, str] | None] = None
     """Names of the first two columns of observations where they are a place in the plane; None elsewhere."""
     simulator_bytes: ClassVar[int] = 0
