@@ -78,7 +78,12 @@ def test_parameters_are_json_and_rebuild_the_task(name: str) -> None:
     environment, parameters = environment_of(name), parameters_of(name)
     restored = json.loads(json.dumps(parameters))
     assert restored == list(parameters)
-    assert len({json.dumps(task) for task in parameters}) == len(parameters) == environment.settings.tasks
+    tasks = draw_tasks(environment)
+    if name == "half-cheetah-dir":  # has two tasks, each once in both splits
+        keys = {(task.split, json.dumps(task.parameters)) for task in tasks}
+    else:
+        keys = {("any", json.dumps(task.parameters)) for task in tasks}
+    assert len(keys) == len(tasks) == environment.settings.tasks
     actions = actions_of(environment)
     again = play(environment.make(restored[2]), actions, seed=1)
     assert again == play(environment.make(parameters[2]), actions, seed=1)
@@ -92,7 +97,8 @@ def test_split_is_a_partition_that_a_build_seed_cannot_move(name: str) -> None:
     assert sum(task.split == "train" for task in tasks) == environment.settings.train
     assert tasks == draw_tasks(environment_of(name))
     other = draw_tasks(environment_of(name, "environment.task_seed=1"))
-    assert [task.split for task in other] != [task.split for task in tasks]
+    is_drawn = environment.settings.split != "interpolation"
+    assert ([task.split for task in other] != [task.split for task in tasks]) == is_drawn
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -48,6 +48,7 @@ def test_sizes_are_the_papers() -> None:
     assert sizes["point-robot-wind"] == sizes["ml1/reach"] == (50, 40)
     assert sizes["sparse-point-robot"] == sizes["half-cheetah-vel"] == (100, 80)
     assert sizes["hopper-rand-params"] == sizes["walker-rand-params"] == (40, 30)
+    assert sizes["ant-dir"] == sizes["ant-goal"] == (40, 30)  # CSRO
 
 
 def test_quick_point_robot_has_sixteen_training_and_four_test_tasks_over_the_half_circle() -> None:

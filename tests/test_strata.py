@@ -14,7 +14,7 @@ from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, Task, load_recipe, open_dataset, split_dataset
 from tcmrl_data.dataset.shift import ParameterShift, parameter_shifts
-from tcmrl_data.envs.tasks import draw_from_strata, draw_tasks, in_order
+from tcmrl_data.envs.tasks import draw_from_strata, draw_tasks, in_order, middles_of_strata
 from tcmrl_data.foundation.errors import RecipeError
 from tcmrl_data.recipe.tasks import choose_tasks
 from tests.commands import in_process
@@ -71,6 +71,17 @@ def test_strata_are_consecutive_and_of_equal_size(size: int, number: int, seed: 
     largest = -(-size // number)
     assert drawn[0] < largest and drawn[-1] >= size - largest
     assert all(after - before < 2 * largest for before, after in pairwise(drawn))
+
+
+def test_interpolation_tests_the_middle_of_every_stratum() -> None:
+    assert middles_of_strata([9, 8, 7, 6, 5, 4], 2) == {8, 5}
+    assert middles_of_strata([9, 8, 7, 6, 5], 2) == {8, 6}  # of two and of three tasks
+    assert middles_of_strata([9, 8, 7], 3) == {9, 8, 7}
+
+
+def test_interpolation_needs_an_order() -> None:
+    with pytest.raises(RecipeError, match="'interpolation', but the tasks of point-robot-wind have no order"):
+        load_recipe("point-robot-wind", overrides=["environment.split=interpolation"])
 
 
 def test_tasks_of_imports_may_lack_what_orders_them() -> None:

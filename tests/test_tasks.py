@@ -3,6 +3,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -96,6 +97,25 @@ def test_spread_keeps_splits_apart_and_takes_the_ends(num_train: int, num_test: 
     assert len(set(chosen)) == len(chosen) == num_train + num_test
     assert splits.count("train") == num_train
     assert {0, 59} <= set(chosen)
+
+
+@given(st.integers(1, 48), st.integers(1, 12))
+def test_spread_on_a_circle_takes_no_two_neighbors(num_train: int, num_test: int) -> None:
+    tasks = [Task(index, "test" if index % 5 == 2 else "train", {}) for index in range(60)]
+    chosen = spread(tasks, num_train=num_train, num_test=num_test, is_circular=True)
+    for split, number, size in (("train", num_train, 48), ("test", num_test, 12)):
+        members = [task.index for task in tasks if task.split == split]
+        places = [members.index(index) for index in chosen if tasks[index].split == split]
+        gaps = [after - before for before, after in pairwise([*places, places[0] + size])]
+        assert len(places) == number
+        assert max(gaps) - min(gaps) <= 1
+
+
+def test_small_profiles_of_the_circle_point_to_all_sides() -> None:
+    for name in ("ant-dir", "ant-goal"):
+        tasks = choose_tasks(load_recipe(name, profile="quick"))
+        tested = [task.index for task in tasks if task.split == "test"]
+        assert tested == [2, 22]  # opposite ones of 40
 
 
 def test_asking_for_more_tasks_than_there_are() -> None:

@@ -33,7 +33,7 @@ def split_dataset(
     """Makes several datasets of one: task folds, or disjoint episodes of every part.
 
     Every task is a test task in one of the folds; all folds hold all parts, which keep ids and bytes. If the
-    recipe splits tasks by strata, the folds do too: each tests tasks that spread over the whole ordering.
+    recipe splits tasks along their ordering, the folds do too: each tests tasks that spread over all of it.
     Of `episodes=(45, 5)` the first dataset has the first 45 episodes of every part and the second the next 5.
 
     Args:
@@ -118,10 +118,11 @@ def plan_fold(source: Dataset, *, folds: int, seed: int, fold: int) -> Plan:
 def _tested(source: Dataset, *, folds: int, seed: int, fold: int) -> set[int]:
     """Indices of the test tasks of a fold: folds are drawn as the recipe draws test tasks.
 
-    By strata, every `folds` neighbors along the environment's ordering go to different folds.
+    By strata and by interpolation, every `folds` neighbors along the environment's ordering go to different
+    folds.
     """
     generator = keyed_generator(seed, source.name, NO_TASK, Purpose.FOLDS)
-    if source.manifest.recipe.environment.split == "strata":
+    if source.manifest.recipe.environment.split != "permutation":
         order = [task.index for task in in_order(source.environment, source.tasks)]
         strata = [order[start : start + folds] for start in range(0, len(order), folds)]
         drawn = [(stratum, generator.permutation(folds).tolist()) for stratum in strata]

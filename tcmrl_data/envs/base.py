@@ -31,8 +31,8 @@ Reward = Literal["stored", "dense"]
 DENSE_REWARDS = "dense_rewards"
 """The extra array that holds shaped rewards beside sparse ones, float32."""
 
-TaskSplit = Literal["permutation", "strata"]
-"""How test tasks are drawn; `EnvironmentSettings` explains both."""
+TaskSplit = Literal["permutation", "strata", "interpolation"]
+"""How test tasks are chosen; `EnvironmentSettings` explains it."""
 
 
 class EnvironmentSettings(BaseModel):
@@ -45,9 +45,10 @@ class EnvironmentSettings(BaseModel):
         train: number of training tasks.
         horizon: steps after which an episode is truncated.
         reward_density: `sparse` if few steps have a reward (paper, Appendix F.3).
-        split: how test tasks are drawn. `permutation`: any of all tasks. `strata`: the tasks, in the order of
-            `Environment.ordering`, are cut into as many strata as there are test tasks, and one task is drawn
-            of each, so that training and test tasks spread alike.
+        split: how test tasks are chosen. `permutation`: any of all tasks are drawn. `strata`: the tasks, in
+            the order of `Environment.ordering`, are cut into as many strata as there are test tasks, and one
+            task is drawn of each, so that training and test tasks spread alike. `interpolation`: as `strata`,
+            but the middle task of each, of an even number the later one; nothing is drawn.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -124,15 +125,17 @@ class Environment(abc.ABC):
     """Dtypes of further per-step arrays, by name."""
     ordering_name: ClassVar[str | None] = None
     """What `ordering` measures, with its unit; None where tasks have no order."""
+    is_circular: ClassVar[bool] = False
+    """Whether `ordering` is a place on a circle, where the last task is beside the first."""
     plane: ClassVar[tuple[str, str] | None] = None
     """Names of the first two columns of observations where they are a place in the plane; None elsewhere."""
     simulator_bytes: ClassVar[int] = 0
     """Measured memory of one simulated task; 0 for tasks without a simulator."""
 
     def __init__(self, settings: EnvironmentSettings) -> None:
-        if settings.split == "strata" and self.ordering_name is None:
+        if settings.split != "permutation" and self.ordering_name is None:
             raise RecipeError(
-                f"environment.split is 'strata', but the tasks of {settings.name} have no order; "
+                f"environment.split is '{settings.split}', but the tasks of {settings.name} have no order; "
                 "set it to 'permutation'"
             )
         self.settings = settings
@@ -308,7 +311,7 @@ def make_environment(settings: Mapping[str, Any]) -> Environment:
 
     Raises:
         UnknownNameError: there is no such environment.
-        RecipeError: a split by strata of tasks that have no order.
+        RecipeError: a split along an order that the tasks lack.
         ValidationError: pydantic's, if the table is not valid.
     """
     kind = ENVIRONMENTS.get(settings["name"])

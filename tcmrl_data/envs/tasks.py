@@ -1,6 +1,6 @@
 """Tasks of an environment: indices, parameters and the fixed split."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Literal
@@ -46,11 +46,14 @@ def draw_tasks(environment: Environment) -> tuple[Task, ...]:
     drawn = environment.draw_parameters(settings.tasks, settings.task_seed)
     tasks = [Task(index, "train", _rounded(parameters)) for index, parameters in enumerate(drawn)]
     generator = keyed_generator(settings.task_seed, environment.name, NO_TASK, Purpose.SPLIT)
-    if settings.split == "strata":
-        order = [task.index for task in in_order(environment, tasks)]
-        test = draw_from_strata(order, settings.tasks - settings.train, generator)
-    else:
-        test = set(generator.permutation(settings.tasks)[settings.train :].tolist())
+    order = [task.index for task in in_order(environment, tasks)]
+    match settings.split:
+        case "strata":
+            test = draw_from_strata(order, settings.tasks - settings.train, generator)
+        case "interpolation":
+            test = middles_of_strata(order, settings.tasks - settings.train)
+        case "permutation":
+            test = set(generator.permutation(settings.tasks)[settings.train :].tolist())
     return tuple(replace(task, split="test") if task.index in test else task for task in tasks)
 
 
@@ -72,8 +75,17 @@ def place_in_order(environment: Environment, task: Task) -> float | None:
 
 def draw_from_strata(order: Sequence[int], number: int, generator: np.random.Generator) -> set[int]:
     """Draws one item of each of `number` strata, which are consecutive and differ in size by at most one."""
-    borders = [stratum * len(order) // number for stratum in range(number + 1)]
-    return {order[int(generator.integers(start, stop))] for start, stop in pairwise(borders)}
+    return {order[int(generator.integers(start, stop))] for start, stop in _strata(len(order), number)}
+
+
+def middles_of_strata(order: Sequence[int], number: int) -> set[int]:
+    """The middle item of each of the strata that `draw_from_strata` draws from."""
+    return {order[(start + stop) // 2] for start, stop in _strata(len(order), number)}
+
+
+def _strata(size: int, number: int) -> Iterator[tuple[int, int]]:
+    """First and last position plus one of `number` strata."""
+    return pairwise(stratum * size // number for stratum in range(number + 1))
 
 
 def _rounded(value: Any) -> Any:

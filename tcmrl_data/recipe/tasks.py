@@ -10,11 +10,11 @@ from tcmrl_data.foundation.errors import TaskError
 from tcmrl_data.recipe.recipe import Recipe
 
 
-def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]:
+def spread(tasks: Sequence[Task], *, num_train: int, num_test: int, is_circular: bool = False) -> list[int]:
     """Indices of `num_train` training and `num_test` test tasks, evenly spaced within their split, ascending.
 
     The tasks are given in the order along which to spread. The first and the last task of a split are taken,
-    so that a smaller selection spans the same range.
+    so that a smaller selection spans the same range; on a circle, where they are neighbors, the first alone.
 
     Raises:
         TaskError: a split has fewer tasks than that.
@@ -24,7 +24,8 @@ def spread(tasks: Sequence[Task], *, num_train: int, num_test: int) -> list[int]
         members = [task.index for task in tasks if task.split == split]
         if number > len(members):
             raise TaskError(f"{number} {split} tasks asked for, the task set has {len(members)}")
-        positions = np.linspace(0, len(members) - 1, number).round().astype(int)
+        last = len(members) if is_circular else len(members) - 1
+        positions = np.linspace(0, last, number, endpoint=not is_circular).round().astype(int)
         chosen.extend(members[position] for position in positions)
     return sorted(chosen)
 
@@ -44,7 +45,12 @@ def choose_tasks(recipe: Recipe, indices: Sequence[int] | None = None) -> list[T
             sum(task.split == split for task in tasks) if wanted is None else wanted
             for split, wanted in (("train", recipe.build.train_tasks), ("test", recipe.build.test_tasks))
         )
-        indices = spread(in_order(environment, tasks), num_train=num_train, num_test=num_test)
+        indices = spread(
+            in_order(environment, tasks),
+            num_train=num_train,
+            num_test=num_test,
+            is_circular=environment.is_circular,
+        )
     for index in indices:
         if not 0 <= index < len(tasks):
             raise TaskError(f"task index {index} does not exist, the tasks are 0-{len(tasks) - 1}")
