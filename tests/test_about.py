@@ -79,6 +79,7 @@ def test_fields_that_are_not_set_are_not_written() -> None:
     assert read_about(FULL, "x").model_dump(mode="json") == FULL
 
 
+@pytest.mark.check
 def test_a_dataset_of_an_earlier_version_opens_and_is_written_alike(tiny_copy: Copy) -> None:
     folder = relicensed(tiny_copy(), {**PLAIN, "licence": "my own words"})
     before = (folder / MANIFEST).read_bytes()

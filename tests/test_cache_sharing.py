@@ -74,6 +74,7 @@ def line(process: "subprocess.Popen[str]") -> str:
     return process.stdout.readline().strip()
 
 
+@pytest.mark.check
 def test_one_process_decodes_while_the_others_wait(
     selection: Selection, tiny_folder: Path, folder: Path
 ) -> None:

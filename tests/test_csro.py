@@ -99,6 +99,7 @@ def test_it_collects_uniformly_at_first_and_then_by_what_it_collected() -> None:
     assert isinstance(algorithm_of("csro", SMALL | {"random_share": 1.0}).explore(lanes), UniformController)
 
 
+@pytest.mark.check
 def test_the_penalty_takes_out_of_representations_what_states_and_actions_tell() -> None:
     """Tasks that differ in states and rewards: what a linear probe reads of z_t from (s_t, a_t)."""
     offset = torch.arange(TASKS).view(TASKS, 1, 1) - 1.0

@@ -59,6 +59,7 @@ def reseal(dataset: Dataset, **changes: object) -> None:
     write_dataset(dataset.folder, **(settings | changes))  # type: ignore[arg-type]
 
 
+@pytest.mark.check
 def test_a_forged_part_is_found(seeds: list[Dataset], tmp_path: Path) -> None:
     derive_dataset(seeds[0], tmp_path / "cut", episodes=2)
     made, key = open_dataset(tmp_path / "cut"), PartKey(1, 300)

@@ -145,6 +145,7 @@ def test_a_killed_worker_is_replaced_and_the_data_are_the_same(
     assert read_manifest(out).complete
 
 
+@pytest.mark.check
 def test_an_error_that_a_unit_reports_is_final_and_the_others_are_done(
     engine: EngineCase, tiny: Dataset, tiny_recipe: Recipe, tmp_path: Path
 ) -> None:
@@ -195,6 +196,7 @@ def test_a_unit_run_twice_at_once_makes_its_data_once(
     assert staged(tmp_path / "data") == []
 
 
+@pytest.mark.check
 def test_a_poison_unit_is_named_the_others_are_done_and_the_exit_code_is_1(
     engine: EngineCase, tiny_folder: Path, directions: Directions, tmp_path: Path
 ) -> None:
@@ -351,6 +353,7 @@ def test_a_worker_that_ends_before_it_has_read_its_spec_is_a_crash(
     assert error in str(result.error)
 
 
+@pytest.mark.check
 def test_parts_whose_messages_are_lost_are_taken_in_all_the_same(
     tiny_recipe: Recipe, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -141,6 +141,7 @@ STEPS = st.builds(
 )
 
 
+@pytest.mark.check
 @settings(max_examples=30)
 @given(steps=st.lists(STEPS, min_size=60, max_size=90))
 def test_a_status_is_the_same_however_often_the_record_was_rotated(

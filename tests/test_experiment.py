@@ -294,6 +294,7 @@ def test_a_failed_run_is_told_and_tried_again(tiny_folder: Path, tmp_path: Path,
     assert call(*arguments, "--quiet")[0] == 1
 
 
+@pytest.mark.check
 @pytest.mark.usefixtures("in_process")
 def test_what_never_began_takes_a_new_device_and_new_threads(
     tiny_folder: Path, tmp_path: Path, call: Call

@@ -76,6 +76,7 @@ def test_other_evaluation_settings_evaluate_the_same_tensors_anew(
     assert result.evaluations != made.results[0].evaluations
 
 
+@pytest.mark.check
 @pytest.mark.parametrize(
     "changes",
     [

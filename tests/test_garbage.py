@@ -62,6 +62,7 @@ def test_gc_spares_a_live_attempt_and_is_refused_during_a_build(tiny_copy: Copy)
             process.communicate(b"")
 
 
+@pytest.mark.check
 def test_the_commands_say_what_they_found_and_did(
     tiny_copy: Copy, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -42,6 +42,7 @@ def interrupt_at(step: int) -> Callable[[TrainingProgress], None]:
     return report
 
 
+@pytest.mark.check
 @pytest.mark.usefixtures("as_in_a_program")
 def test_an_interrupted_run_saves_its_step_and_ends_in_the_same_tensors(
     tiny: Dataset, tmp_path: Path
@@ -57,6 +58,7 @@ def test_an_interrupted_run_saves_its_step_and_ends_in_the_same_tensors(
     assert said == ["going on from step 30"]
 
 
+@pytest.mark.check
 def test_a_run_killed_before_its_first_checkpoint_says_that_it_begins_anew(
     tiny: Dataset, tmp_path: Path
 ) -> None:
@@ -115,6 +117,7 @@ def _logged(folder: Path) -> bool:
     return (folder / "metrics.jsonl").is_file() and bool((folder / "metrics.jsonl").read_text())
 
 
+@pytest.mark.check
 def test_resuming_takes_the_settings_of_the_run_and_no_others(
     tiny: Dataset, tiny_folder: Path, tmp_path: Path, call: Call
 ) -> None:

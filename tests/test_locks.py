@@ -66,6 +66,7 @@ def ask(tiny_folder: Path) -> Iterator[None]:
         asker.communicate()
 
 
+@pytest.mark.check
 @pytest.mark.skipif(not locks.HAS_OPEN_FILE_LOCKS, reason="with flock, a writer can be refused while asked")
 def test_no_writer_is_refused_while_others_ask(ask: None, tiny_folder: Path) -> None:
     for _ in range(STARTS):

@@ -178,6 +178,7 @@ def test_a_power_cut_at_any_moment_loses_nothing_that_was_published(
     figures(f"{states} states after power cuts, all recovered")
 
 
+@pytest.mark.check
 def test_every_sync_is_needed(parts: PreparedParts, half_built: Path, memory: Path) -> None:
     """Without the syncs of any one kind of file or folder, some power cut tears or loses data."""
     root, operations = memory / "whole", logged(parts, half_built, memory, "new")

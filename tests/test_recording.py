@@ -91,6 +91,7 @@ def test_a_reset_truncates_the_open_episode(tmp_path: Path) -> None:
     assert [(len(one), bool(one.truncated[-1])) for one in episodes] == [(2, True)] * 2
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_at_any_operation_loses_the_open_episode_alone(
     fault: Fault, memory: Path, sweep: int, monkeypatch: pytest.MonkeyPatch

@@ -115,6 +115,7 @@ def test_attention_is_relative_and_makes_the_context(trained: FinishedRun, tiny:
     assert found.contexts is not None and found.contexts.shape == (len(stored.lanes), 4)
 
 
+@pytest.mark.check
 def test_weights_of_rewarded_transitions_are_told_apart(trained: FinishedRun, tiny: Dataset) -> None:
     stored = Stored(tiny, "all")
     trajectory = stored.trajectories[0][0]
@@ -239,6 +240,7 @@ def test_a_report_without_checkpoints_says_what_is_left_out(copy: Path, call: Ca
     assert "are omitted: " in text and "is no run" in text and "Time and memory" in text
 
 
+@pytest.mark.check
 def test_a_report_names_the_runs_that_are_missing_and_why(copy: Path) -> None:
     lost = copy / "runs/point-robot--no-context--seed0"
     lost.with_name(f"{lost.name}.json").unlink()
@@ -315,6 +317,7 @@ def test_runs_of_one_algorithm_with_other_settings_are_told_apart(results: Path,
     )
 
 
+@pytest.mark.check
 def test_a_moved_dataset_is_named_with_an_option(
     results: Path, tiny_copy: Callable[[], Path], tmp_path: Path, call: Call
 ) -> None:

@@ -124,6 +124,7 @@ def test_a_rotten_manifest_is_deleted_and_built_again(sound: Path, tmp_path: Pat
     assert content(folder) == good
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("name", [MANIFEST, TASKS, PARTS_TABLE])
 def test_every_flipped_byte_of_a_table_or_manifest_is_named(
     sound: Path, tmp_path: Path, name: str, sweep: int

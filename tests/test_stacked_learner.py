@@ -219,6 +219,7 @@ def trained(agents: list[int], num_updates: int) -> StackedSac:
     return group
 
 
+@pytest.mark.check
 def test_an_agent_does_not_depend_on_its_group() -> None:
     """400 updates alone, in a pair and among seven: what differs is rounding at most."""
     alone = stacked_layers(trained([2], 400), 0)

@@ -158,6 +158,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.check
 def test_ids_do_not_depend_on_workers(dataset: Path, tmp_path: Path) -> None:
     """They do not depend on the order in which groups are built either."""
     for half in ([5], [1, 2, 3]):
@@ -238,6 +239,7 @@ def test_a_snapshot_acts_exactly_like_an_sb3_actor_with_its_weights(dataset: Pat
     assert np.array_equal(controller.act(observations, np.zeros((50, 2), np.float32)), expected)
 
 
+@pytest.mark.check
 def test_agents_learn(tmp_path: Path) -> None:
     """On point-robot-wind, 1,200 steps bring every agent of a group most of the way to the goal."""
     overrides = (

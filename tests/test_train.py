@@ -53,7 +53,7 @@ def test_precision_reaches_training_and_keeps_it_repeatable(start: Train) -> Non
     assert start("third", "run.precision=float32", steps=20).digest != first.digest
 
 
-@pytest.mark.parametrize("brac", ["off", "policy"])
+@pytest.mark.parametrize("brac", ["off", pytest.param("policy", marks=pytest.mark.check)])
 def test_resuming_at_50_gives_the_same_parameters_at_100(start: Train, tiny: Dataset, brac: str) -> None:
     mode = f"actor_critic.brac.mode={brac}"
     straight = start("straight", mode, steps=100)
