@@ -39,6 +39,9 @@ def digest(value: Any) -> str:
 
 
 TASKS: dict[str, str] = {
+    "ant-dir": "af2f5f44ba19e5a3",
+    "ant-goal": "a5fc0720ab6d5bda",
+    "half-cheetah-dir": "75b4a9d6220575c6",
     "half-cheetah-vel": "15879b9e9768c611",
     "hopper-rand-params": "be161a0420ce8b12",
     "ml1/button-press-topdown": "d9c74c07e3c00d89",

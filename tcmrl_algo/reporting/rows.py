@@ -42,7 +42,7 @@ class RunRow:
         method: label.
         algorithm: name of the method in code.
         privileged: whether the method observes the task parameters.
-        actor_critic: what trains the policy: `sac`, `sac+brac`, `sac+cloning`, or `own`.
+        actor_critic: what trains the policy: `sac`, `sac+brac`, `sac+cloning`, `iql`, `bc`, or `own`.
         snapshots: which snapshots transitions come from: `all`, `last` or a condition.
         context_snapshots: the same of contexts, where it differs.
         tuned: trials and steps of the search for the settings, and where.
@@ -328,6 +328,8 @@ def actor_critic(settings: TrainingSettings, algorithm: str) -> str:
     """What trains the policy of a run, as the table says it."""
     if algorithm == "macaw":
         return "own"
+    if settings.actor_critic.kind != "sac":
+        return settings.actor_critic.kind
     regularized = settings.actor_critic.brac.mode != "off"
     return f"sac{'+brac' * regularized}{'+cloning' * (settings.actor_critic.cloning > 0)}"
 
