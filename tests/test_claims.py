@@ -8,6 +8,7 @@ from tcmrl_algo.experiment.config import Claim, Experiment, read_experiment
 from tcmrl_algo.experiment.results import ContextMeasures, RunResult, coverage
 from tcmrl_algo.reporting.claims import Verdict, compare, correct, judge, measure
 from tcmrl_algo.reporting.sources import FinishedRun, Source
+from tcmrl_data import TcmrlError
 from tests import experiments
 from tests.experiments import made_result, with_setting
 
@@ -113,6 +114,26 @@ def test_a_claim_is_judged_under_every_protocol_unless_it_names_some() -> None:
         [claim, claim | {"protocols": ["idaq"]}, claim | {"metric": "training_seconds"}], results
     )
     assert [verdict.protocol for verdict in judge(source)] == ["offline", "paper", "idaq", "idaq", None]
+
+
+def test_a_registered_test_is_not_corrected_and_corrects_no_other() -> None:
+    """One environment under the first protocol; p = 0.0132 as below, 5 × 0.0132 is above 0.05."""
+    results = [
+        made_result(method, seed, final, protocols=("offline", "paper"))
+        for seed in range(5)
+        for method, final in (("A", seed + 1.0), ("B", 0.0))
+    ]
+    claim = {"text": "", "better": "A", "worse": "B", "protocols": ["offline", "paper"]}
+    others = [claim | {"metric": metric} for metric in ("normalized", "shuffled")]
+    verdicts = judge(_source([claim | {"registered": "point-robot"}, *others], results))
+    first, *rest = verdicts
+    assert (first.protocol, first.is_registered, first.verdict) == ("offline", True, "supported")
+    assert first.adjusted == first.probability == pytest.approx(0.01324, abs=1e-5)
+    assert [found.is_registered for found in rest] == [False] * 5
+    assert [found.adjusted for found in rest] == [pytest.approx(5 * 0.013236, abs=1e-4)] * 5
+    assert {found.verdict for found in rest} == {"cannot tell"}
+    with pytest.raises(TcmrlError, match="registered for 'hopper'"):
+        _source([claim | {"registered": "hopper"}], results)
 
 
 def test_verdicts_are_corrected_for_their_number() -> None:

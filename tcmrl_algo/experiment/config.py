@@ -84,6 +84,8 @@ class Claim(_Table):
         against: what is taken from `worse`, where that is another metric.
         protocols: of evaluation, under each of which the claim is judged; all of the experiment's where
             empty. A metric that does not depend on the protocol is judged once.
+        registered: the environment that decides a claim which was written before its runs, under the
+            experiment's first protocol, by one uncorrected two-sided test. Everything else is exploratory.
     """
 
     text: str
@@ -92,6 +94,7 @@ class Claim(_Table):
     metric: Metric = "final"
     against: Metric | None = None
     protocols: tuple[str, ...] = ()
+    registered: str | None = None
 
 
 class Experiment(_Table):
@@ -138,6 +141,11 @@ class Experiment(_Table):
                 if label not in self.methods:
                     known = ", ".join(map(repr, self.methods))
                     raise ValueError(f"claim {claim.text!r} names no method {label!r}; they are {known}")
+            if claim.registered is not None and claim.registered not in self.environments:
+                known = ", ".join(self.environments)
+                raise ValueError(
+                    f"claim {claim.text!r} is registered for {claim.registered!r}; environments are {known}"
+                )
             for protocol in claim.protocols:
                 if protocol not in self.protocols:
                     raise ValueError(

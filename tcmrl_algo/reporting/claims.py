@@ -32,7 +32,9 @@ class Verdict:
         mean: mean of the differences; None if there are none.
         low, high: 95% interval of the mean by Student's t, uncorrected; None with fewer than five pairs.
         probability: two-sided p value against a mean of 0, with Student's t; None as the interval.
-        adjusted: the p value, corrected for all verdicts of the experiment by Holm's method.
+        is_registered: the claim was written before its runs, and this is the one test that decides it.
+        adjusted: the p value; of a test that is not registered, corrected for all such verdicts of the
+            experiment by Holm's method.
         covers: what interval and p value cover: numbers of seeds, folds and test tasks.
         unequal: settings that all methods share and in which these two differ, as `key left, right`.
         verdict: `supported` or `contradicted`, by the sign of the mean, if `adjusted` is below 0.05, else
@@ -49,6 +51,7 @@ class Verdict:
     low: float | None
     high: float | None
     probability: float | None
+    is_registered: bool
     adjusted: float | None
     covers: str
     unequal: tuple[str, ...]
@@ -57,8 +60,12 @@ class Verdict:
 
 def judge(source: Source) -> list[Verdict]:
     """Verdicts on all claims of an experiment, in its environments, under its protocols."""
+    primary = source.experiment.protocols[0]
     compared = [
-        compare(claim, environment, source.results(environment), protocol=protocol)
+        replace(
+            compare(claim, environment, source.results(environment), protocol=protocol),
+            is_registered=claim.registered == environment and protocol in (primary, None),
+        )
         for claim in source.experiment.claims
         for environment in source.environments()
         for protocol in _protocols(claim, source.experiment.protocols)
@@ -67,10 +74,13 @@ def judge(source: Source) -> list[Verdict]:
 
 
 def correct(verdicts: Sequence[Verdict]) -> list[Verdict]:
-    """The verdicts, each after Holm's correction for the number of those that have a p value."""
-    adjusted = iter(holm([found.probability for found in verdicts if found.probability is not None]))
+    """The verdicts, by the p value where they are registered, else by Holm's correction for all others."""
+    explored = [found.probability for found in verdicts if not found.is_registered]
+    corrected = iter(holm([value for value in explored if value is not None]))
     return [
-        found if found.probability is None else _decided(replace(found, adjusted=next(adjusted)))
+        found
+        if found.probability is None
+        else _decided(replace(found, adjusted=found.probability if found.is_registered else next(corrected)))
         for found in verdicts
     ]
 
@@ -109,6 +119,7 @@ def compare(claim: Claim, environment: str, results: Sequence[RunResult], *, pro
         low=low,
         high=high,
         probability=sign_probability(gains),
+        is_registered=False,
         adjusted=None,
         covers=coverage(first),
         unequal=tuple(f"`{key}` {one}, {other}" for key, (one, other) in unequal.items()),

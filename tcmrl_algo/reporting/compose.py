@@ -28,9 +28,10 @@ policy. A `(privileged)` method is a control that observes the task parameters."
 CLAIMS = """\
 Differences are taken run by run (same seed, same fold), and positive differences support the claim, which \
 is judged under every protocol that it concerns. The 95% interval of the mean difference is by Student's t, \
-for this comparison alone. `p, corrected` is the p value of the same test after Holm's correction for all \
-verdicts of the experiment: below 0.05 a claim is supported or contradicted, by the sign of the mean. With \
-fewer than five runs there is no interval and no verdict. `unequal settings` are those that all methods \
+for this comparison alone, and `p` is the p value of the same test. A `registered` test was named before its \
+runs: it alone decides its claim, uncorrected. All others are `exploratory`, and their p values are after \
+Holm's correction for all of them. Below 0.05 a claim is supported or contradicted, by the sign of the mean. \
+With fewer than five runs there is no interval and no verdict. `unequal settings` are those that all methods \
 share and in which the two compared differ, first and second: where a search found them, a difference may \
 be theirs."""
 ADAPTATION = """\

@@ -74,9 +74,10 @@ def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
         interval = interval_text(found.differences, found.low, found.high) if found.pairs else None
         what = (found.claim, found.environment, found.comparison, found.protocol)
         unequal = "; ".join(found.unequal) or None
-        rows.append((*what, found.mean, interval, found.adjusted, found.verdict, unequal, found.covers))
+        test = "registered" if found.is_registered else "exploratory"
+        rows.append((*what, found.mean, interval, found.adjusted, test, found.verdict, unequal, found.covers))
     columns = ("claim", "environment", "compared", "protocol", "mean difference", "95% interval")
-    more = ("p, corrected", "verdict", "unequal settings", "interval covers")
+    more = ("p", "test", "verdict", "unequal settings", "interval covers")
     return Table(name, (*columns, *more), tuple(rows))
 
 
