@@ -212,14 +212,12 @@ def test_a_poison_unit_is_named_the_others_are_done_and_the_exit_code_is_1(
     assert not read_manifest(out).complete
 
 
+@pytest.mark.check
 @pytest.mark.parametrize(
     ("engine", "number"),
     [
         pytest.param("local", signal.SIGINT, id="local-SIGINT"),
-        *(
-            pytest.param(*case.values, signal.SIGTERM, marks=[*case.marks, pytest.mark.check])
-            for case in CASES
-        ),
+        *(pytest.param(*case.values, signal.SIGTERM, marks=case.marks) for case in CASES),
     ],
     indirect=["engine"],
 )

@@ -32,6 +32,7 @@ def test_every_task_set_has_a_recipe_and_an_expert(name: str) -> None:
     assert actions.shape == (1, 4) and np.abs(actions).max() <= 1.0
 
 
+@pytest.mark.check
 @pytest.mark.parametrize("name", ML1_IN_FULL)
 def test_a_task_is_ml1s_without_its_constructor(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     import metaworld

@@ -24,10 +24,10 @@ EVALUATED = ("run.episodes=3", "run.random_episodes=1", "run.repeats=1", "run.ca
 TASKS = {"ant-dir": [0, 2, 20], "ant-goal": [0, 2, 20], "half-cheetah-dir": [0, 1, 2, 3]}
 """Tasks that are built; both splits are among them."""
 
-FAMILIES = ["ant-dir", *(pytest.param(name, marks=pytest.mark.sweep) for name in TASKS if name != "ant-dir")]
+pytestmark = pytest.mark.check
 
 
-@pytest.fixture(scope="module", params=FAMILIES)
+@pytest.fixture(scope="module", params=TASKS)
 def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Dataset:
     folder = tmp_path_factory.mktemp(request.param) / "data"
     recipe = load_recipe(request.param, profile="quick", overrides=SHORT)
