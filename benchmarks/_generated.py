@@ -6,10 +6,10 @@ import numpy as np
 
 import tcmrl_data
 from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
-from tcmrl_data.build.ledger import Ledger
-from tcmrl_data.build.part import seal_part
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.published import Published
+from tcmrl_data.building.ledger import Ledger
+from tcmrl_data.building.part import seal_part
+from tcmrl_data.building.plan import BuildPlan
+from tcmrl_data.building.published import Published
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory

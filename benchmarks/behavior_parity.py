@@ -26,8 +26,8 @@ import numpy.typing as npt
 from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.build.part import roll_out_part
-from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.building.part import roll_out_part
+from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.recipe.tasks import choose_tasks
 

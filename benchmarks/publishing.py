@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 import tcmrl_data
-from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.building.unit import UnitSpec, run_unit
 from tcmrl_data.foundation import canonical
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import Disk, make_folders

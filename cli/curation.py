@@ -100,7 +100,7 @@ def derive(
       tcmrl-data derive data/point-robot --episodes 10 --seed 0 --split train --out data/few-episodes
     """
     import tcmrl_data
-    from tcmrl_data.curation.derive import describe_far
+    from tcmrl_data.operations.derive import describe_far
 
     def make(progress: PartsProgress) -> "Derived":
         return tcmrl_data.derive_dataset(

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from tcmrl_data import open_dataset, verify_dataset
-from tcmrl_data.build.events import EVENTS
+from tcmrl_data.building.events import EVENTS
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING
 from tcmrl_data.store.keys import PartKey
 

@@ -30,7 +30,7 @@ ORPHAN_SECONDS = 60.0
 """A worker that still lives so long after its driver is an orphan."""
 
 START = """
-import tcmrl_data.build.build, tcmrl_data.curation.extend, tcmrl_data.interchange.importing
+import tcmrl_data.building.build, tcmrl_data.operations.extend, tcmrl_data.interchange.importing
 from tcmrl_cli.data import main
 print("ready", flush=True)
 main()

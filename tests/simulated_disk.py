@@ -13,8 +13,8 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, BuildReport, Dataset, Recipe, TcmrlError
-from tcmrl_data.build import build, ledger
-from tcmrl_data.build.published import read_published
+from tcmrl_data.building import build, ledger
+from tcmrl_data.building.published import read_published
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import STAGING, Disk, replace_file

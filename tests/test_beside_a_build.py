@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from tcmrl_data import Dataset, Recipe, build_status, open_dataset, verify_dataset
-from tcmrl_data.build import ledger
+from tcmrl_data.building import ledger
 from tcmrl_data.verification import verify
 from tcmrl_data.verification.scan import Scan, scan_dataset
 from tests.simulated_disk import PreparedParts

@@ -21,11 +21,11 @@ from tcmrl_data import (
     open_dataset,
     roll_out,
 )
-from tcmrl_data.build.driver import Driver
-from tcmrl_data.build.events import BuildEvent, EventLog
-from tcmrl_data.build.ledger import Ledger
-from tcmrl_data.build.plan import plan_build
-from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.building.driver import Driver
+from tcmrl_data.building.events import BuildEvent, EventLog
+from tcmrl_data.building.ledger import Ledger
+from tcmrl_data.building.plan import plan_build
+from tcmrl_data.building.unit import UnitSpec, run_unit
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.envs.base import LaneStep
 from tcmrl_data.envs.point_robot import PointRobotLanes

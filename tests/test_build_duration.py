@@ -5,8 +5,8 @@ import itertools
 import pytest
 
 import tcmrl_data
-from tcmrl_data.build import probe
-from tcmrl_data.build.duration import Measurement, makespan, task_seconds
+from tcmrl_data.building import probe
+from tcmrl_data.building.duration import Measurement, makespan, task_seconds
 from tests.conftest import TINY
 
 

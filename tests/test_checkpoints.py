@@ -15,9 +15,9 @@ from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.build.events import EVENTS, BuildEvent
-from tcmrl_data.build.plan import plan_build
-from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.building.events import EVENTS, BuildEvent
+from tcmrl_data.building.plan import plan_build
+from tcmrl_data.building.unit import UnitSpec, run_unit
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS
@@ -187,8 +187,8 @@ SAVE_OR_LOAD = """
 import json, sys
 import numpy as np
 from tcmrl_data.behavior.checkpoints import TrainingState
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.unit import UnitSpec, _checkpoints
+from tcmrl_data.building.plan import BuildPlan
+from tcmrl_data.building.unit import UnitSpec, _checkpoints
 spec = UnitSpec.from_json(json.loads(sys.argv[2]))
 plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks)
 checkpoints = _checkpoints(spec, plan, spec.tasks, print)

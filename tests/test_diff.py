@@ -12,9 +12,9 @@ from tcmrl_cli.data import data
 import tcmrl_data
 from tcmrl_data import Dataset, derive_dataset, diff_datasets, extend_dataset, open_dataset
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.curation.assembly import Copied, derivation_of, open_assembly
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_making import make_part
 from tests.commands import assert_refused, in_process

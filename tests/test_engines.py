@@ -17,8 +17,8 @@ import torch
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
-from tcmrl_data.build.driver import WORKER
-from tcmrl_data.build.unit import UnitSpec
+from tcmrl_data.building.driver import WORKER
+from tcmrl_data.building.unit import UnitSpec
 from tcmrl_data.engine import _attempt
 from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit, longest_first
 from tcmrl_data.engine.in_process import InProcessEngine

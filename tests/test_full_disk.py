@@ -12,7 +12,7 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, Dataset
-from tcmrl_data.build.events import EventLog
+from tcmrl_data.building.events import EventLog
 from tcmrl_data.foundation.errors import BuildError, CacheError, StorageError
 from tcmrl_data.foundation.sizes import size
 from tcmrl_data.sampling.cache import cached_rows

@@ -12,7 +12,7 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, Dataset, Recipe, load_recipe, open_dataset, repair_dataset, verify_dataset
-from tcmrl_data.build import ledger
+from tcmrl_data.building import ledger
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError, ManifestError, TaskError
 from tcmrl_data.store import limits, manifest, tables

@@ -11,9 +11,9 @@ from typing import Any
 import pytest
 
 from tcmrl_data import Recipe
-from tcmrl_data.build import nodes
-from tcmrl_data.build.nodes import check_nodes
-from tcmrl_data.build.plan import BuildPlan, plan_build
+from tcmrl_data.building import nodes
+from tcmrl_data.building.nodes import check_nodes
+from tcmrl_data.building.plan import BuildPlan, plan_build
 from tcmrl_data.engine._attempt import run_attempt
 from tcmrl_data.engine.base import BaseEngine, Message, NodeReport, Result, Unit
 from tcmrl_data.engine.local import LocalEngine

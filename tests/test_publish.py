@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from tcmrl_data import Dataset, Recipe, open_dataset, verify_dataset
-from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, lock_holder, publish_folder, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, LockedError, StorageError

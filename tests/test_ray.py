@@ -18,10 +18,10 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, Recipe, load_recipe
-from tcmrl_data.build import nodes
-from tcmrl_data.build.nodes import WORKER as NODE_WORKER
-from tcmrl_data.build.nodes import check_nodes
-from tcmrl_data.build.plan import plan_build
+from tcmrl_data.building import nodes
+from tcmrl_data.building.nodes import WORKER as NODE_WORKER
+from tcmrl_data.building.nodes import check_nodes
+from tcmrl_data.building.plan import plan_build
 from tcmrl_data.engine.base import ATTEMPTS, Unit
 from tcmrl_data.engine.ray import RayEngine
 from tcmrl_data.foundation.errors import BuildError

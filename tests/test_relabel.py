@@ -24,10 +24,10 @@ from tcmrl_data import (
     relabel_dataset,
     verify_dataset,
 )
-from tcmrl_data.curation.assembly import Copied, derivation_of, open_assembly
 from tcmrl_data.envs.controller import PlaybackController
 from tcmrl_data.foundation.errors import BuildError, SelectionError, SimulationError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
+from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_making import make_part
 from tests.commands import assert_refused, in_process

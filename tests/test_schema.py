@@ -12,7 +12,7 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import Dataset
-from tcmrl_data.build.events import BuildEvent, EventLog
+from tcmrl_data.building.events import BuildEvent, EventLog
 from tcmrl_data.card.schema import SchemaKind, json_schema, schema_file
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part_record import RECORD
@@ -105,7 +105,7 @@ def test_recipes_of_all_profiles_satisfy_the_schema() -> None:
 
 
 def test_lines_of_events_satisfy_the_schema(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tcmrl_data.build.events.EVENTS_BYTES", 700)
+    monkeypatch.setattr("tcmrl_data.building.events.EVENTS_BYTES", 700)
     event = BuildEvent("part", "task_00003", 0, 5, 1, 15, 0, 750, "published")
     with EventLog(tmp_path, lambda event: None) as log:
         for _ in range(4):

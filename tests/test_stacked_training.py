@@ -18,10 +18,10 @@ from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.behavior.stacked.source import StackedSettings, StackedSource, _make_training
 from tcmrl_data.behavior.stacked.training import GroupTraining
-from tcmrl_data.build.ledger import Ledger
-from tcmrl_data.build.plan import BuildPlan, plan_build
-from tcmrl_data.build.unit import UnitSpec, run_unit
-from tcmrl_data.build.work_files import checkpoint_name
+from tcmrl_data.building.ledger import Ledger
+from tcmrl_data.building.plan import BuildPlan, plan_build
+from tcmrl_data.building.unit import UnitSpec, run_unit
+from tcmrl_data.building.work_files import checkpoint_name
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import CHECKPOINTS, make_folders
 from tcmrl_data.foundation.errors import BuildError
@@ -383,7 +383,7 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
         "import json, re, sys\n"
         "from pathlib import Path\n"
         "from tcmrl_data.behavior import checkpoints\n"
-        "from tcmrl_data.build.unit import UnitSpec, run_unit\n"
+        "from tcmrl_data.building.unit import UnitSpec, run_unit\n"
         "checkpoints.CheckpointFolder.is_due = lambda self: True\n"
         "run_unit(UnitSpec.from_json(json.load(sys.stdin)), lambda message: None)\n"
         "print(1024 * int(re.search(r'VmHWM:\\s+(\\d+) kB', Path('/proc/self/status').read_text())[1]))\n"

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from tcmrl_data import verify_dataset
-from tcmrl_data.build.events import EVENTS
+from tcmrl_data.building.events import EVENTS
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
 from tcmrl_data.foundation.errors import (
     ManifestError,

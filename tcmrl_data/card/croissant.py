@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.build.work_files import CROISSANT, CROISSANT_PARTS, CROISSANT_TASKS
+from tcmrl_data.building.work_files import CROISSANT, CROISSANT_PARTS, CROISSANT_TASKS
 from tcmrl_data.card.citing import citation_of, citation_text
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.canonical import canonical_json, sha256

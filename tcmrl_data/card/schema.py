@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 
 from pydantic import Field, TypeAdapter, create_model
 
-from tcmrl_data.build.events import BuildEvent
+from tcmrl_data.building.events import BuildEvent
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.recipe.document import RECIPE_SCHEMA
 from tcmrl_data.recipe.recipe import Recipe

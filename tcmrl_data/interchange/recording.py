@@ -11,13 +11,13 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Box
 
-from tcmrl_data.curation.assembly import derivation_of, open_assembly
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.interchange.readers.episodes import Cuts, episode
+from tcmrl_data.operations.assembly import derivation_of, open_assembly
 from tcmrl_data.recipe.foreign import bound_recipe, check_licence, foreign_recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack

@@ -4,15 +4,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from tcmrl_data.curation.cutting import SUBSET, read_cut
-from tcmrl_data.curation.derived import read_settings
-from tcmrl_data.curation.extension import EXTEND, Extension
-from tcmrl_data.curation.relabelling import RELABEL, Relabelling
-from tcmrl_data.curation.stored import first_episode_of
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import RenderingError, SelectionError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
+from tcmrl_data.operations.cutting import SUBSET, read_cut
+from tcmrl_data.operations.derived import read_settings
+from tcmrl_data.operations.extension import EXTEND, Extension
+from tcmrl_data.operations.relabelling import RELABEL, Relabelling
+from tcmrl_data.operations.stored import first_episode_of
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_record import Identity
 

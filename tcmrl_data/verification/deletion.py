@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.work_files import (
+from tcmrl_data.building.work_files import (
     ASSEMBLY,
     CROISSANT_FILES,
     TABLES,

@@ -4,14 +4,14 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.curation.cutting import SUBSET, cut_part, read_cut
-from tcmrl_data.curation.merging import MERGE, plan_merge
-from tcmrl_data.curation.plan import Plan, PlannedPart
-from tcmrl_data.curation.split import EPISODES, FOLD, plan_episodes, plan_fold
-from tcmrl_data.curation.subset import Choice, plan_subset
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.errors import SelectionError, TcmrlError
 from tcmrl_data.foundation.plain_files import one_line
+from tcmrl_data.operations.cutting import SUBSET, cut_part, read_cut
+from tcmrl_data.operations.merging import MERGE, plan_merge
+from tcmrl_data.operations.plan import Plan, PlannedPart
+from tcmrl_data.operations.split import EPISODES, FOLD, plan_episodes, plan_fold
+from tcmrl_data.operations.subset import Choice, plan_subset
 from tcmrl_data.store.keys import part_file
 from tcmrl_data.store.manifest import MANIFEST, Derivation
 from tcmrl_data.store.part_record import PartRecord

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.work_files import check_work_files, checkpoint_tasks
+from tcmrl_data.building.work_files import check_work_files, checkpoint_tasks
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import (
     CHECKPOINTS,

@@ -3,14 +3,14 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from tcmrl_data.build.build import build_dataset
-from tcmrl_data.build.events import BuildEvent
-from tcmrl_data.curation.extension import EXTEND
-from tcmrl_data.curation.remaking import Job, RemakeSpec, remake_parts
+from tcmrl_data.building.build import build_dataset
+from tcmrl_data.building.events import BuildEvent
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.foundation.errors import BuildError, StoreError
 from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.operations.extension import EXTEND
+from tcmrl_data.operations.remaking import Job, RemakeSpec, remake_parts
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import Run

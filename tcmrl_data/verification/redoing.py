@@ -3,8 +3,8 @@
 from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 
-from tcmrl_data.curation.relabelling import RELABEL
 from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.operations.relabelling import RELABEL
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import Run

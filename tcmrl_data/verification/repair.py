@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.events import BuildEvent
-from tcmrl_data.build.published import Published, numbered, read_published
-from tcmrl_data.build.work_files import check_work_files
+from tcmrl_data.building.events import BuildEvent
+from tcmrl_data.building.published import Published, numbered, read_published
+from tcmrl_data.building.work_files import check_work_files
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import (
     LOCK,

@@ -10,13 +10,13 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import read_snapshot
-from tcmrl_data.build.part import roll_out_part
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.curation.derived import read_settings
-from tcmrl_data.curation.extension import EXTEND, Extension, extended_episodes
-from tcmrl_data.curation.relabelling import RELABEL, Relabelling, relabelled_episodes
+from tcmrl_data.building.part import roll_out_part
+from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import TcmrlError
+from tcmrl_data.operations.derived import read_settings
+from tcmrl_data.operations.extension import EXTEND, Extension, extended_episodes
+from tcmrl_data.operations.relabelling import RELABEL, Relabelling, relabelled_episodes
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import pack, read_arrays, unpack

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.work_files import WORK_FILES, WORK_FOLDERS
+from tcmrl_data.building.work_files import WORK_FILES, WORK_FOLDERS
 from tcmrl_data.foundation.plain_files import one_line
 
 MAX_DEPTH = 10

@@ -6,7 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from tcmrl_data.build.published import Published, numbered, read_published
+from tcmrl_data.building.published import Published, numbered, read_published
 from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores

@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.work_files import DESCRIPTIONS
+from tcmrl_data.building.work_files import DESCRIPTIONS
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.view import is_view_file
 from tcmrl_data.foundation.disk import LOCK, lock_holder

@@ -7,8 +7,8 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.build.published import Published, read_published
-from tcmrl_data.build.work_files import ASSEMBLY, check_work_files
+from tcmrl_data.building.published import Published, read_published
+from tcmrl_data.building.work_files import ASSEMBLY, check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.canonical import canonical_json, sha256

@@ -6,13 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.build.part import check_finite
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.published import Published, read_published
-from tcmrl_data.curation.derived import derived_fields
-from tcmrl_data.curation.extension import Extension, extended_episodes
-from tcmrl_data.curation.relabelling import RELABEL, Relabelling, relabelled_episodes
-from tcmrl_data.curation.remaking import Job, RemakeSpec
+from tcmrl_data.building.part import check_finite
+from tcmrl_data.building.plan import BuildPlan
+from tcmrl_data.building.published import Published, read_published
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.base import Lanes
@@ -21,6 +17,10 @@ from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.operations.derived import derived_fields
+from tcmrl_data.operations.extension import Extension, extended_episodes
+from tcmrl_data.operations.relabelling import RELABEL, Relabelling, relabelled_episodes
+from tcmrl_data.operations.remaking import Job, RemakeSpec
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.keys import part_file
 from tcmrl_data.store.part_making import NO_REFERENCES, make_part

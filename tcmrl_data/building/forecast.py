@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass
 
-from tcmrl_data.build.duration import estimate_duration
-from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.building.duration import estimate_duration
+from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.foundation.machine import available_cores
 
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from tcmrl_data.build.history import History, is_number, is_summary
+from tcmrl_data.building.history import History, is_number, is_summary
 from tcmrl_data.foundation.disk import LOCK, STAGING, lock_holder, move_into_place, named_errors, replace_file
 from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.store.manifest import Manifest, dataset_folder, read_manifest

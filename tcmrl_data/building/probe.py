@@ -1,4 +1,4 @@
-"""The process that measures one unit for a forecast: `python -m tcmrl_data.build.probe`.
+"""The process that measures one unit for a forecast: `python -m tcmrl_data.building.probe`.
 
 It trains the unit's tasks with the recipe's own networks, group and update rates, but a short warm-up, makes
 two parts in a temporary folder, and stops when enough updates were seen.
@@ -15,9 +15,9 @@ from typing import Any
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.build.part import PartMaker
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.unit import UnitSpec
+from tcmrl_data.building.part import PartMaker
+from tcmrl_data.building.plan import BuildPlan
+from tcmrl_data.building.unit import UnitSpec
 from tcmrl_data.engine.worker import Send, serve
 from tcmrl_data.envs.tasks import Task
 

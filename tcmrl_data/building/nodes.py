@@ -7,13 +7,13 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.engine.base import BaseEngine, NodeReport, Unit
 from tcmrl_data.foundation.disk import STAGING, make_folders, write_file
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.store.platform import Platform
 
-WORKER = "tcmrl_data.build.node_worker"
+WORKER = "tcmrl_data.building.node_worker"
 """Module that describes a machine."""
 
 FOLDER_SECONDS = 30.0

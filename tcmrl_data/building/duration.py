@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.behavior.base import BehaviorSource
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.unit import UnitSpec
+from tcmrl_data.building.plan import BuildPlan
+from tcmrl_data.building.unit import UnitSpec
 from tcmrl_data.engine.base import ENGINES, Unit
 from tcmrl_data.foundation.errors import BuildError
 
-WORKER = "tcmrl_data.build.probe"
+WORKER = "tcmrl_data.building.probe"
 PROBE_TIMEOUT = 600.0
 MARGIN = 0.15
 """Added to the spread of the measurements, for what varies over more than their few seconds."""

@@ -4,10 +4,10 @@ from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.curation.assembly import Copied, open_assembly
-from tcmrl_data.curation.cutting import Cut, cut_part
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.tasks import Task
+from tcmrl_data.operations.assembly import Copied, open_assembly
+from tcmrl_data.operations.cutting import Cut, cut_part
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import Derivation, Manifest, Run
 from tcmrl_data.store.part_record import PartRecord

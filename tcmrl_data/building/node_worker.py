@@ -1,4 +1,4 @@
-"""The process that describes a machine: `python -m tcmrl_data.build.node_worker`, a JSON spec on its input.
+"""Describes a machine: `python -m tcmrl_data.building.node_worker`; a JSON spec on its input.
 
 It answers in two messages, because another version of the package may not understand the recipe.
 """

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.build.published import Published
-from tcmrl_data.build.work_files import check_work_files
-from tcmrl_data.curation.appending import append_parts
-from tcmrl_data.curation.assembly import Copied, derivation_of, open_assembly
-from tcmrl_data.curation.extension import EXTEND, MAX_NOISE
-from tcmrl_data.curation.pairs import nearest_pairs, runs_of_pairs
-from tcmrl_data.curation.remaking import Job, RemakeSpec, remake_parts
-from tcmrl_data.curation.stored import check_parts, keys_of_run, simulated_run
+from tcmrl_data.building.published import Published
+from tcmrl_data.building.work_files import check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.disk import LOCK, lock_file, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, StoreError
+from tcmrl_data.operations.appending import append_parts
+from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
+from tcmrl_data.operations.extension import EXTEND, MAX_NOISE
+from tcmrl_data.operations.pairs import nearest_pairs, runs_of_pairs
+from tcmrl_data.operations.remaking import Job, RemakeSpec, remake_parts
+from tcmrl_data.operations.stored import check_parts, keys_of_run, simulated_run
 from tcmrl_data.recipe.recipe import Rollouts
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.manifest import Run, read_manifest

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from tcmrl_data.build.published import Published, numbered
+from tcmrl_data.building.published import Published, numbered
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import BuildError, StoreError

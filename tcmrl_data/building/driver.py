@@ -6,17 +6,17 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.build.events import BuildEvent, EventKind, EventLog
-from tcmrl_data.build.ledger import Ledger
-from tcmrl_data.build.nodes import check_nodes
-from tcmrl_data.build.published import Published
-from tcmrl_data.build.unit import UnitSpec
+from tcmrl_data.building.events import BuildEvent, EventKind, EventLog
+from tcmrl_data.building.ledger import Ledger
+from tcmrl_data.building.nodes import check_nodes
+from tcmrl_data.building.published import Published
+from tcmrl_data.building.unit import UnitSpec
 from tcmrl_data.engine.base import BaseEngine, Result, Unit
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.shared_folder import VISIBLE_SECONDS
 from tcmrl_data.store.keys import PartKey, part_file
 
-WORKER = "tcmrl_data.build.worker"
+WORKER = "tcmrl_data.building.worker"
 """Module that does a unit."""
 
 

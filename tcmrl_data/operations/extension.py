@@ -5,8 +5,8 @@ from typing import Any
 from pydantic import Field
 
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.build.part import roll_out_part
-from tcmrl_data.build.plan import BuildPlan
+from tcmrl_data.building.part import roll_out_part
+from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.envs.base import Lanes
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.records import Record

@@ -7,7 +7,7 @@ import stat
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
-from tcmrl_data.build.events import EARLIER_EVENTS, EVENTS
+from tcmrl_data.building.events import EARLIER_EVENTS, EVENTS
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
 from tcmrl_data.foundation.errors import BuildError
@@ -18,7 +18,7 @@ from tcmrl_data.store.task_table import TASKS
 
 WORK_FOLDERS = {STAGING, CHECKPOINTS}
 ASSEMBLY = ".assembly.json"
-"""What is being put together in a folder that is no dataset yet, see `curation/assembly.py`."""
+"""What is being put together in a folder that is no dataset yet, see `operations/assembly.py`."""
 
 WORK_FILES = {LOCK, EVENTS, EARLIER_EVENTS, ASSEMBLY}
 """A verification looks at their kind only, never into them."""

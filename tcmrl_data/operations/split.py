@@ -4,15 +4,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from tcmrl_data.curation.assembly import check_out, derivation_of
-from tcmrl_data.curation.cutting import Cut
-from tcmrl_data.curation.derive import Derived, summary
-from tcmrl_data.curation.plan import Plan, PlannedPart, Progress, carry_out, no_progress, settle_runs
-from tcmrl_data.curation.view_file import write_view
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.tasks import Split, in_order
 from tcmrl_data.foundation.errors import ManifestError, SelectionError
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
+from tcmrl_data.operations.assembly import check_out, derivation_of
+from tcmrl_data.operations.cutting import Cut
+from tcmrl_data.operations.derive import Derived, summary
+from tcmrl_data.operations.plan import Plan, PlannedPart, Progress, carry_out, no_progress, settle_runs
+from tcmrl_data.operations.view_file import write_view
 from tcmrl_data.store.manifest import read_manifest
 
 FOLD, EPISODES = "fold", "episodes"

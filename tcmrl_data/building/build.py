@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.build.driver import Driver
-from tcmrl_data.build.events import BuildEvent, EventLog
-from tcmrl_data.build.ledger import Ledger
-from tcmrl_data.build.plan import plan_build
-from tcmrl_data.build.work_files import ASSEMBLY, WORK_FILES, WORK_FOLDERS, check_work_files
+from tcmrl_data.building.driver import Driver
+from tcmrl_data.building.events import BuildEvent, EventLog
+from tcmrl_data.building.ledger import Ledger
+from tcmrl_data.building.plan import plan_build
+from tcmrl_data.building.work_files import ASSEMBLY, WORK_FILES, WORK_FOLDERS, check_work_files
 from tcmrl_data.engine.base import BaseEngine, make_engine
 from tcmrl_data.foundation.canonical import differences
 from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned

@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.curation.assembly import check_out, derivation_of, open_assembly
-from tcmrl_data.curation.pairs import Pair, nearest_pairs, runs_of_pairs
-from tcmrl_data.curation.relabelling import RELABEL, Relabelling, relabelled_episodes
-from tcmrl_data.curation.remaking import Job, RemakeSpec, remake_parts
-from tcmrl_data.curation.stored import check_parts, first_episode_of, keys_of_run, simulated_run
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError, SelectionError
+from tcmrl_data.operations.assembly import check_out, derivation_of, open_assembly
+from tcmrl_data.operations.pairs import Pair, nearest_pairs, runs_of_pairs
+from tcmrl_data.operations.relabelling import RELABEL, Relabelling, relabelled_episodes
+from tcmrl_data.operations.remaking import Job, RemakeSpec, remake_parts
+from tcmrl_data.operations.stored import check_parts, first_episode_of, keys_of_run, simulated_run
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.limits import MAX_RUNS
 from tcmrl_data.store.manifest import Run

@@ -5,12 +5,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from tcmrl_data.curation.assembly import derivation_of
-from tcmrl_data.curation.plan import Plan, PlannedPart, settle_runs
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.canonical import canonical_json, differences, digest
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.operations.assembly import derivation_of
+from tcmrl_data.operations.plan import Plan, PlannedPart, settle_runs
 from tcmrl_data.recipe.about import merged_about
 from tcmrl_data.store.keys import MAIN_RUN, RUN_NAME, PartKey
 from tcmrl_data.store.manifest import Run

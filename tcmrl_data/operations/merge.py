@@ -3,13 +3,13 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from tcmrl_data.curation.assembly import check_out
-from tcmrl_data.curation.derive import Derived, summary
-from tcmrl_data.curation.merging import plan_merge
-from tcmrl_data.curation.plan import Progress, carry_out, no_progress
-from tcmrl_data.curation.rename import check_label
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.operations.assembly import check_out
+from tcmrl_data.operations.derive import Derived, summary
+from tcmrl_data.operations.merging import plan_merge
+from tcmrl_data.operations.plan import Progress, carry_out, no_progress
+from tcmrl_data.operations.rename import check_label
 
 
 def merge_datasets(

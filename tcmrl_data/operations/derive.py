@@ -4,15 +4,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.curation.assembly import check_out
-from tcmrl_data.curation.plan import Plan, Progress, carry_out, no_progress
-from tcmrl_data.curation.rename import check_label
-from tcmrl_data.curation.subset import Choice, plan_subset
-from tcmrl_data.curation.view_file import write_view
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.tiers import MEDIUM_SCORE, medium_scores
 from tcmrl_data.envs.tasks import Split
 from tcmrl_data.foundation.errors import SelectionError, TierError
+from tcmrl_data.operations.assembly import check_out
+from tcmrl_data.operations.plan import Plan, Progress, carry_out, no_progress
+from tcmrl_data.operations.rename import check_label
+from tcmrl_data.operations.subset import Choice, plan_subset
+from tcmrl_data.operations.view_file import write_view
 from tcmrl_data.store.manifest import read_manifest
 
 TOLERANCE = 15.0

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.build.published import Published
+from tcmrl_data.building.published import Published
 from tcmrl_data.engine.base import ENGINES, Unit
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.errors import BuildError
@@ -15,7 +15,7 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.keys import PartKey
 
-WORKER = "tcmrl_data.curation.worker"
+WORKER = "tcmrl_data.operations.worker"
 UNITS_PER_WORKER = 4
 """Starting a process takes seconds, a part often less; few units balance well enough."""
 

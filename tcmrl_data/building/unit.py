@@ -8,9 +8,9 @@ from typing import Any
 
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.build.part import PartMaker
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.work_files import checkpoint_name
+from tcmrl_data.building.part import PartMaker
+from tcmrl_data.building.plan import BuildPlan
+from tcmrl_data.building.work_files import checkpoint_name
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import canonical_json, digest

@@ -1,8 +1,8 @@
-"""The process of one unit of a build: `python -m tcmrl_data.build.worker`, a JSON spec on standard input."""
+"""The process of one unit of a build: `python -m tcmrl_data.building.worker`, a JSON spec on its input."""
 
 from typing import Any
 
-from tcmrl_data.build.unit import UnitSpec, run_unit
+from tcmrl_data.building.unit import UnitSpec, run_unit
 from tcmrl_data.engine.worker import Send, serve
 
 

@@ -6,8 +6,8 @@ from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.published import Published, read_published
+from tcmrl_data.building.plan import BuildPlan
+from tcmrl_data.building.published import Published, read_published
 from tcmrl_data.foundation.disk import STAGING, named_errors, replace_file
 from tcmrl_data.foundation.errors import (
     BuildError,

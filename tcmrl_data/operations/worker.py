@@ -1,10 +1,10 @@
-"""The process that makes parts from stored ones: `python -m tcmrl_data.curation.worker`."""
+"""The process that makes parts from stored ones: `python -m tcmrl_data.operations.worker`."""
 
 from typing import Any
 
-from tcmrl_data.curation.publishing import publish_parts
-from tcmrl_data.curation.remaking import RemakeSpec
 from tcmrl_data.engine.worker import Send, serve
+from tcmrl_data.operations.publishing import publish_parts
+from tcmrl_data.operations.remaking import RemakeSpec
 
 
 def work(spec: dict[str, Any], report: Send) -> str:

@@ -7,8 +7,8 @@ from typing import Any, final
 import numpy as np
 
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.build.plan import BuildPlan
-from tcmrl_data.build.published import Published, read_published
+from tcmrl_data.building.plan import BuildPlan
+from tcmrl_data.building.published import Published, read_published
 from tcmrl_data.envs.base import Environment, Lanes, Parameters
 from tcmrl_data.envs.controller import Controller, NoisyController, UniformController
 from tcmrl_data.envs.rollout import roll_out

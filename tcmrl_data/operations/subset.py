@@ -8,14 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from tcmrl_data.curation.assembly import derivation_of
-from tcmrl_data.curation.cutting import SUBSET, Cut
-from tcmrl_data.curation.plan import Plan, PlannedPart, settle_runs
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.tiers import MEDIUM_SCORE, task_scores
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator
+from tcmrl_data.operations.assembly import derivation_of
+from tcmrl_data.operations.cutting import SUBSET, Cut
+from tcmrl_data.operations.plan import Plan, PlannedPart, settle_runs
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_record import STANDARD_ARRAYS
 
