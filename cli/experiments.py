@@ -121,7 +121,7 @@ def experiment(
     Examples:
       tcmrl experiment --list
       tcmrl experiment tour --workers 2
-      tcmrl experiment figure10 --seeds 0-2 --steps 1000 --out results/short
+      tcmrl experiment window_length --seeds 0-2 --steps 1000 --out results/short
       tcmrl experiment figure4_half_cheetah_vel --profile paper --build --data data/paper
       tcmrl experiment table2 --tuned tuning --reuse results/figure4_point_robot
       tcmrl experiment mine.toml --data /disk/datasets --only TCMRL --only FOCAL

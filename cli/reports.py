@@ -67,11 +67,11 @@ def report(
 
     \b
     Examples:
-      tcmrl report results/figure5
-      tcmrl report results/figure5 results/figure10 --out reports/ablations
+      tcmrl report results/perspectives
+      tcmrl report results/perspectives results/window_length --out reports/ablations
       tcmrl report runs/point-robot-tcmrl-seed0 --out report
-      tcmrl report results/figure5 --dataset /disk/point-robot
-      tcmrl report results/figure5 --rows results/runs.csv
+      tcmrl report results/perspectives --dataset /disk/point-robot
+      tcmrl report results/perspectives --rows results/runs.csv
       tcmrl report tuning/point-robot-tcmrl --rows results/tuning.csv
       tcmrl report results/runs.csv
     """

@@ -17,7 +17,7 @@ def runs(root: Path | None, as_json: bool, quiet: bool) -> None:
     \b
     Examples:
       tcmrl runs
-      tcmrl runs results/figure5 --json
+      tcmrl runs results/perspectives --json
     """
     from tcmrl_algo.training.listing import list_runs
 

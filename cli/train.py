@@ -50,8 +50,8 @@ def tcmrl() -> None:
       tcmrl train data/point-robot
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all
       tcmrl tune data/point-robot --algo focal --trials 16
-      tcmrl experiment figure5 --workers 2
-      tcmrl report results/figure5
+      tcmrl experiment perspectives --workers 2
+      tcmrl report results/perspectives
 
     Exit codes: 0 success, 1 incomplete work, 2 bad usage or bad input.
     """

@@ -218,7 +218,7 @@ def test_a_bad_file_is_refused_before_anything_starts(
 
 
 def test_unknown_names_and_broken_files_are_refused(tmp_path: Path, call: Call) -> None:
-    assert_refused(call("experiment", "figur5"), "figur5", "did you mean figure5")
+    assert_refused(call("experiment", "perspective"), "perspective", "did you mean perspectives")
     assert_refused(call("experiment"), "--list")
     assert_refused(call("experiment", tmp_path / "none.toml"), "none.toml")
     (tmp_path / "broken.toml").write_text("name = ")

@@ -214,8 +214,8 @@ def load_experiment(name: str | Path) -> Experiment:
             that is like one that is like another.
 
     Example:
-        >>> load_experiment("figure5").source
-        'Figure 5'
+        >>> load_experiment("table2").seeds
+        (0, 1, 2, 3, 4)
     """
     return read_experiment(_tables(name), place=f"experiment {str(name)!r}")
 

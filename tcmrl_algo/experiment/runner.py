@@ -105,8 +105,8 @@ def run_experiment(
         TcmrlError: the plan does not hold, or the folder has runs of other settings or data.
 
     Example:
-        >>> experiment = load_experiment("figure5")  # doctest: +SKIP
-        >>> run_experiment(experiment, "results/figure5", workers=2).results  # doctest: +SKIP
+        >>> experiment = load_experiment("perspectives")  # doctest: +SKIP
+        >>> run_experiment(experiment, "results/perspectives", workers=2).results  # doctest: +SKIP
     """
     began, out, cores = time.perf_counter(), Path(out), len(os.sched_getaffinity(0))
     usable_device(device)

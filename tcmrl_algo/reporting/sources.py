@@ -121,7 +121,7 @@ def read_sources(
 
 
 def natural_order(name: str) -> list[tuple[str, int]]:
-    """Sorts `figure10` after `figure5`."""
+    """Sorts `figure13` after `figure4`."""
     return [(text, int(digits or 0)) for text, digits in re.findall(r"(\D*)(\d*)", name)]
 
 

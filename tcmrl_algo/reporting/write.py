@@ -65,7 +65,7 @@ def write_report(
             is no table.
 
     Example:
-        >>> write_report(["results/figure5"], "reports/figure5").verdicts  # doctest: +SKIP
+        >>> write_report(["results/perspectives"], "reports/perspectives").verdicts  # doctest: +SKIP
     """
     out = Path(out)
     measured = measure_paths(paths, datasets=datasets, report=report)
