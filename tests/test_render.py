@@ -16,10 +16,9 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import Dataset, FigureCamera, RenderingError, Trajectory, render_episode
-from tcmrl_data.envs._open_gl import find_open_gl
-from tcmrl_data.envs._simulation import SimulatedTask
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment
 from tcmrl_data.envs.controller import UniformController
+from tcmrl_data.envs.simulation import SimulatedTask, find_open_gl
 from tcmrl_data.foundation.errors import SelectionError, SimulationError
 from tcmrl_data.rendering.filming import film
 from tcmrl_data.rendering.stored_episode import StoredEpisode, find_episode

@@ -14,17 +14,13 @@ no contact forces, and here it is off by default. Observations are 29 values wit
 """
 
 import math
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
-import gymnasium
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint, squared_norm
-from tcmrl_data.envs._simulation_camera import Viewpoint
-from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
-from tcmrl_data.envs.camera import Camera
-from tcmrl_data.envs.controller import View
+from tcmrl_data.envs.base import EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, Viewpoint, squared_norm
 from tcmrl_data.envs.trajectory import FloatArray
 
 if TYPE_CHECKING:
@@ -65,7 +61,7 @@ class AntGoalSettings(EnvironmentSettings):
 
 
 @final
-class AntDir(Environment):
+class AntDir(SimulatedEnvironment):
     """Directions evenly spaced on the circle; dense reward; episodes end at the horizon only."""
 
     name = "ant-dir"
@@ -74,7 +70,7 @@ class AntDir(Environment):
     action_dim = ACTION_DIM
     ordering_name = "direction (rad)"
     is_circular = True
-    simulator_bytes = 2 * 2**20
+    physics: ClassVar = {"observation": "qpos without x and y, qvel"}
     settings: AntDirSettings
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
@@ -86,31 +82,21 @@ class AntDir(Environment):
     def make(
         self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> "AntDirTask":
-        return AntDirTask(float(parameters["direction"]), self.settings)
+        return AntDirTask(self, parameters)
 
-    def camera(
-        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
-    ) -> Camera:
-        assert isinstance(task, AntDirTask)
-        return task.camera("track", width=width, height=height)
-
-    def fingerprint(self) -> dict[str, Any]:
-        return _fingerprint("qpos without x and y, qvel")
+    def simulator(self) -> Any:
+        return _simulator(place=False, terminate=self.settings.terminate_when_unhealthy)
 
 
 @final
 class AntDirTask(SimulatedTask):
     """The ant with one direction, an angle in rad."""
 
-    def __init__(self, direction: float, settings: AntDirSettings) -> None:
-        super().__init__(
-            _simulator(place=False, terminate=settings.terminate_when_unhealthy),
-            horizon=settings.horizon,
-            observation_dim=AntDir.observation_dim,
-            action_dim=ACTION_DIM,
-        )
+    def __init__(self, environment: AntDir, parameters: Parameters) -> None:
+        super().__init__(environment, environment.simulator())
+        direction = float(parameters["direction"])
         self._direction = math.cos(direction), math.sin(direction)
-        self._is_full = settings.reward == "full"
+        self._is_full = environment.settings.reward == "full"
 
     def reward(self, action: FloatArray, simulator_reward: float, info: dict[str, Any]) -> float:
         x, y = self._direction
@@ -122,7 +108,7 @@ class AntDirTask(SimulatedTask):
 
 
 @final
-class AntGoal(Environment):
+class AntGoal(SimulatedEnvironment):
     """Goals evenly spaced on a circle around the start; dense reward; episodes end at the horizon only."""
 
     name = "ant-goal"
@@ -132,7 +118,8 @@ class AntGoal(Environment):
     ordering_name = "goal angle (rad)"
     is_circular = True
     plane = ("x", "y")
-    simulator_bytes = 2 * 2**20
+    viewpoint: ClassVar = Viewpoint((0.0, 0.0, 0.0), distance=8.0, azimuth=90.0, elevation=-60.0)
+    physics: ClassVar = {"observation": "qpos, qvel"}
     settings: AntGoalSettings
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
@@ -146,14 +133,10 @@ class AntGoal(Environment):
     def make(
         self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> "AntGoalTask":
-        x, y = parameters["goal"]
-        return AntGoalTask((float(x), float(y)), self.settings)
+        return AntGoalTask(self, parameters)
 
-    def camera(
-        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
-    ) -> Camera:
-        assert isinstance(task, AntGoalTask)
-        return task.camera(FROM_ABOVE, width=width, height=height)
+    def simulator(self) -> Any:
+        return _simulator(place=True, terminate=False, contact_cost=self.settings.contact_cost)
 
     def draw_path(
         self, axes: "Axes", parameters: Parameters, observations: FloatArray, *, color: str
@@ -163,25 +146,15 @@ class AntGoal(Environment):
         axes.plot(observations[:, 0], observations[:, 1], "-", color=color, linewidth=1)
         axes.set_aspect("equal")
 
-    def fingerprint(self) -> dict[str, Any]:
-        return _fingerprint("qpos, qvel")
-
-
-FROM_ABOVE = Viewpoint((0.0, 0.0, 0.0), distance=8.0, azimuth=90.0, elevation=-60.0)
-
 
 @final
 class AntGoalTask(SimulatedTask):
     """The ant with one goal, a place (x, y) in m."""
 
-    def __init__(self, goal: tuple[float, float], settings: AntGoalSettings) -> None:
-        super().__init__(
-            _simulator(place=True, terminate=False, contact_cost=settings.contact_cost),
-            horizon=settings.horizon,
-            observation_dim=AntGoal.observation_dim,
-            action_dim=ACTION_DIM,
-        )
-        self._goal, self._control_cost = goal, settings.control_cost
+    def __init__(self, environment: AntGoal, parameters: Parameters) -> None:
+        super().__init__(environment, environment.simulator())
+        x, y = parameters["goal"]
+        self._goal, self._control_cost = (float(x), float(y)), environment.settings.control_cost
 
     def reward(self, action: FloatArray, simulator_reward: float, info: dict[str, Any]) -> float:
         x, y = self._goal
@@ -206,11 +179,3 @@ def _simulator(*, place: bool, terminate: bool, contact_cost: float = CONTACT_CO
         include_cfrc_ext_in_observation=False,
         exclude_current_positions_from_observation=not place,
     )
-
-
-def _fingerprint(observation: str) -> dict[str, Any]:
-    simulator = _simulator(place=True, terminate=False)
-    try:
-        return simulation_fingerprint(simulator) | {"observation": observation}
-    finally:
-        simulator.close()

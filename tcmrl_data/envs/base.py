@@ -1,4 +1,8 @@
-"""Base classes of environments and of their settings, and lanes, which step several episodes together."""
+"""What an environment of another package needs: base classes of environments, settings, lanes and cameras.
+
+Lanes step several episodes together. Controllers and trajectories have files of their own; their names stand
+here too.
+"""
 
 import abc
 import importlib.resources
@@ -13,14 +17,37 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data.envs.camera import Camera
-from tcmrl_data.envs.controller import Controller, View
-from tcmrl_data.envs.trajectory import BoolArray, FloatArray
+from tcmrl_data.envs.controller import Controller, Transition, View
+from tcmrl_data.envs.trajectory import BoolArray, FloatArray, Trajectory
 from tcmrl_data.foundation.errors import RecipeError, RenderingError
 from tcmrl_data.foundation.plugins import Registry, unknown_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+
+__all__ = [
+    "DENSE_REWARDS",
+    "ENVIRONMENTS",
+    "BoolArray",
+    "Camera",
+    "Controller",
+    "Environment",
+    "EnvironmentLanes",
+    "EnvironmentRegistry",
+    "EnvironmentSettings",
+    "FigureCamera",
+    "FloatArray",
+    "LaneStep",
+    "Lanes",
+    "Parameters",
+    "Picture",
+    "Reward",
+    "TaskSplit",
+    "Trajectory",
+    "Transition",
+    "View",
+    "make_environment",
+]
 
 Parameters = Mapping[str, Any]
 """JSON values that define one task."""
@@ -33,6 +60,12 @@ DENSE_REWARDS = "dense_rewards"
 
 TaskSplit = Literal["permutation", "strata", "interpolation"]
 """How test tasks are chosen; `EnvironmentSettings` explains it."""
+
+Picture = npt.NDArray[np.uint8]
+"""(height, width, 3), red, green and blue."""
+
+FIGURE_WIDTH = 3.2
+"""Width of a figure in inches; a wider picture shows the same at a higher resolution."""
 
 
 class EnvironmentSettings(BaseModel):
@@ -107,6 +140,50 @@ class Lanes(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Frees the simulators."""
+
+
+class Camera(abc.ABC):
+    """Takes pictures of one task; it changes neither the task nor its random numbers."""
+
+    @abc.abstractmethod
+    def picture(self, observations: FloatArray) -> Picture:
+        """The task as it is now.
+
+        Args:
+            observations: (t + 1, observation_dim), full view, of the episode up to now.
+        """
+
+    def close(self) -> None:
+        """Frees what the camera holds; does nothing by default."""
+
+
+class FigureCamera(Camera):
+    """Base class of cameras that draw what they see of the observations with matplotlib; sizes in pixels."""
+
+    def __init__(self, width: int, height: int) -> None:
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.figure import Figure
+
+        dpi = width / FIGURE_WIDTH
+        self._canvas = FigureCanvasAgg(Figure(figsize=(FIGURE_WIDTH, height / dpi), dpi=dpi))
+        self._axes = self._canvas.figure.add_axes((0.0, 0.0, 1.0, 1.0))
+
+    @abc.abstractmethod
+    def draw(self, axes: "Axes", observations: FloatArray) -> None:
+        """Draws the task on empty axes that fill the picture and have no frame.
+
+        Args:
+            axes: where to draw; the method sets their limits.
+            observations: as for `picture`.
+        """
+
+    def picture(self, observations: FloatArray) -> Picture:
+        self._axes.clear()
+        self._axes.set_axis_off()
+        self.draw(self._axes, observations)
+        canvas: Any = self._canvas  # matplotlib's types leave these methods out
+        canvas.draw()
+        return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
 class Environment(abc.ABC):

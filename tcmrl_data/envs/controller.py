@@ -1,4 +1,4 @@
-"""Base class of controllers, which choose the actions of a batch of lanes."""
+"""Controllers, which choose the actions of a batch of lanes."""
 
 import abc
 from collections.abc import Iterable
@@ -75,35 +75,6 @@ class UniformController(Controller):
 
 
 @final
-class NoisyController(Controller):
-    """Another controller's actions with normal noise added, for one rollout.
-
-    Args:
-        controller: whose actions these are.
-        sigma: standard deviation of the noise; rollouts clip the sum to [-1, 1].
-        generators: of the noise, one per lane, so that the controller's own noise stays what it is.
-    """
-
-    def __init__(
-        self, controller: Controller, sigma: float, generators: Iterable[np.random.Generator]
-    ) -> None:
-        self.view = controller.view
-        self._controller, self._sigma, self._generators = controller, sigma, iter(generators)
-
-    def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
-        own = self._controller.draw_noise(generator, num_steps, action_dim)
-        more = next(self._generators).standard_normal((num_steps, action_dim), dtype=np.float32)
-        return np.concatenate([own, more], axis=1)
-
-    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
-        own, more = np.split(noise, 2, axis=1)
-        return self._controller.act(observations, own) + np.float32(self._sigma) * more
-
-    def observe(self, transition: Transition) -> None:
-        self._controller.observe(transition)
-
-
-@final
 class PlaybackController(Controller):
     """Plays stored actions, whatever it observes, for one rollout.
 
@@ -118,3 +89,74 @@ class PlaybackController(Controller):
         step, self._step = self._step, self._step + 1
         nothing = np.zeros(noise.shape[1], dtype=np.float32)
         return np.stack([actions[step] if step < len(actions) else nothing for actions in self._actions])
+
+
+class _Wrapper(Controller):
+    """Base class of controllers that change another one's observations, noise or actions."""
+
+    def __init__(self, controller: Controller) -> None:
+        self.view = controller.view
+        self._controller = controller
+
+    def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
+        return self._controller.draw_noise(generator, num_steps, action_dim)
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        return self._controller.act(observations, noise)
+
+    def observe(self, transition: Transition) -> None:
+        self._controller.observe(transition)
+
+
+@final
+class NoisyController(_Wrapper):
+    """Another controller's actions with normal noise added, for one rollout.
+
+    Args:
+        controller: whose actions these are.
+        sigma: standard deviation of the noise; rollouts clip the sum to [-1, 1].
+        generators: of the noise, one per lane, so that the controller's own noise stays what it is.
+    """
+
+    def __init__(
+        self, controller: Controller, sigma: float, generators: Iterable[np.random.Generator]
+    ) -> None:
+        super().__init__(controller)
+        self._sigma, self._generators = sigma, iter(generators)
+
+    def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
+        own = super().draw_noise(generator, num_steps, action_dim)
+        more = next(self._generators).standard_normal((num_steps, action_dim), dtype=np.float32)
+        return np.concatenate([own, more], axis=1)
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        own, more = np.split(noise, 2, axis=1)
+        return super().act(observations, own) + np.float32(self._sigma) * more
+
+
+@final
+class BelievingController(_Wrapper):
+    """Another controller that keeps seeing the hidden entries of its own task, whatever the task is.
+
+    Args:
+        controller: whose actions these are.
+        hidden: (observation_dim,) bool, entries of full observations to replace.
+        values: (observation_dim,), what to replace them by.
+    """
+
+    def __init__(self, controller: Controller, hidden: BoolArray, values: FloatArray) -> None:
+        super().__init__(controller)
+        self._hidden, self._values = hidden, values
+
+    def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
+        if self.view == "full":
+            observations = np.where(self._hidden, self._values, observations)
+        return super().act(observations, noise)
+
+
+@final
+class DeterministicController(_Wrapper):
+    """Another controller without its noise, which for a Gaussian policy is its most likely action."""
+
+    def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
+        return np.zeros((num_steps, action_dim), dtype=np.float32)

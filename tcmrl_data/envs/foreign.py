@@ -5,8 +5,7 @@ from typing import Any, Literal, NoReturn, final
 import numpy as np
 from pydantic import Field, model_validator
 
-from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
-from tcmrl_data.envs.controller import View
+from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward, View
 from tcmrl_data.foundation.errors import SimulationError
 
 
@@ -70,11 +69,6 @@ class Foreign(Environment):
 
 
 def _refuse() -> NoReturn:
-    """Raises.
-
-    Raises:
-        SimulationError: always.
-    """
     raise SimulationError(
         "the data were imported without an environment, so that nothing can be simulated; import them again "
         "with --environment NAME if they come from one that `tcmrl-data envs` lists"

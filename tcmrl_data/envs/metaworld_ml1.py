@@ -12,22 +12,16 @@ import warnings
 from collections.abc import Sequence
 from typing import Any, ClassVar, final
 
-import gymnasium
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint
-from tcmrl_data.envs._simulation_camera import Viewpoint
-from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
-from tcmrl_data.envs.camera import Camera
-from tcmrl_data.envs.controller import Controller, View
+from tcmrl_data.envs.base import Controller, EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, Viewpoint
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import TaskError
 
 GOAL = slice(-3, None)
 TASKS_PER_SET = 50
-VIEWPOINT = Viewpoint(look_at=(0.0, 0.68, 0.14), distance=1.35, azimuth=225.0, elevation=-25.0)
-"""In front of the table; Meta-World's own cameras stand upside down."""
 TASK_SETS = (
     "assembly", "basketball", "bin-picking", "box-close", "button-press", "button-press-topdown",
     "button-press-topdown-wall", "button-press-wall", "coffee-button", "coffee-pull", "coffee-push",
@@ -53,7 +47,7 @@ class MetaWorldML1Settings(EnvironmentSettings):
 
 
 @final
-class MetaWorldML1(Environment):
+class MetaWorldML1(SimulatedEnvironment):
     """One ML1 task set; episodes end only at the horizon; `success` is Meta-World's value per step."""
 
     name = "ml1"
@@ -62,6 +56,9 @@ class MetaWorldML1(Environment):
     action_dim = 4
     plane = ("hand, x in m", "hand, y in m")
     simulator_bytes = 24 * 2**20
+    packages = ("metaworld",)
+    # in front of the table; Meta-World's own cameras stand upside down
+    viewpoint: ClassVar = Viewpoint((0.0, 0.68, 0.14), distance=1.35, azimuth=225.0, elevation=-25.0)
     extras: ClassVar = {"success": np.bool_}
 
     def __init__(self, settings: EnvironmentSettings) -> None:
@@ -86,7 +83,7 @@ class MetaWorldML1(Environment):
             raise TaskError(
                 f"{self.name}: a task of {parameters['env_name']!r} does not belong to this environment"
             )
-        return MetaWorldML1Task(parameters, view=view, horizon=self.settings.horizon)
+        return MetaWorldML1Task(self, parameters, view=view)
 
     def stored_view(self, observations: FloatArray) -> FloatArray:
         hidden = observations.copy()
@@ -96,20 +93,10 @@ class MetaWorldML1(Environment):
     def scripted(self, parameters: Sequence[Parameters], noise: float) -> "ExpertController":
         return ExpertController([task["env_name"] for task in parameters], noise)
 
-    def camera(
-        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
-    ) -> Camera:
-        assert isinstance(task, MetaWorldML1Task)
-        return task.camera(VIEWPOINT, width=width, height=height)
-
-    def fingerprint(self) -> dict[str, Any]:
+    def simulator(self) -> Any:
         from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-        simulator: Any = ALL_V3_ENVIRONMENTS[self._env_name]()
-        try:
-            return simulation_fingerprint(simulator, "metaworld")
-        finally:
-            simulator.close()
+        return ALL_V3_ENVIRONMENTS[self._env_name]()
 
 
 @functools.cache
@@ -127,13 +114,16 @@ def _random_vectors(env_name: str, task_seed: int) -> tuple[tuple[float, ...], .
 class MetaWorldML1Task(SimulatedTask):
     """One goal of a task set."""
 
-    def __init__(self, parameters: Parameters, *, view: View, horizon: int) -> None:
-        super().__init__(
-            _simulator(parameters, horizon),
-            horizon=horizon,
-            observation_dim=MetaWorldML1.observation_dim,
-            action_dim=MetaWorldML1.action_dim,
-        )
+    def __init__(self, environment: MetaWorldML1, parameters: Parameters, *, view: View) -> None:
+        from metaworld.types import Task
+
+        # made without Meta-World's benchmark object, which is slow; the goal is hidden in `observe`
+        simulator, vector = environment.simulator(), np.array(parameters["rand_vec"])
+        task = {"env_cls": type(simulator), "rand_vec": vector, "partially_observable": False}
+        # a step beyond it raises an error
+        simulator.max_path_length = max(simulator.max_path_length, environment.settings.horizon)
+        simulator.set_task(Task(parameters["env_name"], pickle.dumps(task)))
+        super().__init__(environment, simulator)
         self._hides_goal = view == "stored"
 
     def observe(self, observation: FloatArray) -> FloatArray:
@@ -147,19 +137,6 @@ class MetaWorldML1Task(SimulatedTask):
 
     def extras(self, info: dict[str, Any]) -> dict[str, Any]:
         return {"success": bool(info["success"])}
-
-
-def _simulator(parameters: Parameters, horizon: int) -> gymnasium.Env[Any, Any]:
-    """Meta-World's environment of a task with a visible goal, made without the slow benchmark object."""
-    from metaworld.env_dict import ALL_V3_ENVIRONMENTS
-    from metaworld.types import Task
-
-    kind = ALL_V3_ENVIRONMENTS[parameters["env_name"]]
-    task = {"env_cls": kind, "rand_vec": np.array(parameters["rand_vec"]), "partially_observable": False}
-    simulator = kind()
-    simulator.max_path_length = max(simulator.max_path_length, horizon)  # a step beyond it raises an error
-    simulator.set_task(Task(parameters["env_name"], pickle.dumps(task)))
-    return simulator
 
 
 @final

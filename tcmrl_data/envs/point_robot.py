@@ -15,22 +15,29 @@ from pydantic import Field
 
 from tcmrl_data.envs.base import (
     DENSE_REWARDS,
+    Camera,
+    Controller,
     Environment,
     EnvironmentSettings,
+    FigureCamera,
     Lanes,
     LaneStep,
     Parameters,
     Reward,
+    View,
 )
-from tcmrl_data.envs.camera import Camera
-from tcmrl_data.envs.controller import Controller, View
-from tcmrl_data.envs.point_robot_camera import PointRobotCamera, draw_task
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 STEP_SIZE = 0.1
+
+CENTER, WIDTH = (0.0, 0.4), 2.7
+"""What a picture shows at least: the half circle of goals with some room."""
+
+WIND_AT, WIND_SCALE = (-0.9, 1.0), 6.0
+"""Where the wind's arrow starts, and how many times it is longer than the wind."""
 
 
 class PointRobotSettings(EnvironmentSettings):
@@ -105,40 +112,40 @@ class _PointRobot(Environment):
         return GreedyController(*goals_and_winds(parameters))
 
 
-@final
-class PointRobot(_PointRobot):
-    """Goals evenly spaced on the half circle; dense reward -dist."""
+class _HalfCircleRobot(_PointRobot):
+    """Goals (cos a, sin a) at angles a evenly spaced from 0 to pi, without wind."""
 
-    name = "point-robot"
     ordering_name = "goal angle (rad)"
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
-        return half_circle_goals(num_tasks)
+        angles = np.linspace(0.0, np.pi, num_tasks)
+        return [{"goal": [math.cos(angle), math.sin(angle)], "wind": [0.0, 0.0]} for angle in angles]
 
     def ordering(self, parameters: Parameters) -> float:
-        return goal_angle(parameters)
+        x, y = parameters["goal"]
+        return math.atan2(y, x)
 
 
 @final
-class SparsePointRobot(_PointRobot):
-    """Goals evenly spaced on the half circle; a reward only near the goal."""
+class PointRobot(_HalfCircleRobot):
+    """Goals on the half circle; dense reward -dist."""
+
+    name = "point-robot"
+
+
+@final
+class SparsePointRobot(_HalfCircleRobot):
+    """Goals on the half circle; a reward only near the goal."""
 
     name = "sparse-point-robot"
     Settings = SparsePointRobotSettings
     settings: SparsePointRobotSettings
-    ordering_name = "goal angle (rad)"
 
     def __init__(self, settings: EnvironmentSettings) -> None:
         super().__init__(settings)
         if self.settings.dense_rewards:
             # of the class elsewhere; here the recipe says whether they are stored
             self.extras = {DENSE_REWARDS: np.float32}  # type: ignore[misc]
-
-    def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
-        return half_circle_goals(num_tasks)
-
-    def ordering(self, parameters: Parameters) -> float:
-        return goal_angle(parameters)
 
     def rewards(self, distances: FloatArray, reward: Reward) -> FloatArray:
         if reward == "dense":
@@ -162,18 +169,6 @@ class PointRobotWind(_PointRobot):
         limit = self.settings.wind_limit
         winds = [random.uniform(-limit, limit, num_tasks) for _ in range(2)]
         return [{"goal": [1.0, 0.0], "wind": [float(x), float(y)]} for x, y in zip(*winds, strict=True)]
-
-
-def half_circle_goals(num_tasks: int) -> list[dict[str, Any]]:
-    """Goals (cos a, sin a) at angles linspace(0, pi, num_tasks), without wind."""
-    angles = np.linspace(0.0, np.pi, num_tasks)
-    return [{"goal": [math.cos(angle), math.sin(angle)], "wind": [0.0, 0.0]} for angle in angles]
-
-
-def goal_angle(parameters: Parameters) -> float:
-    """Angle of the goal in rad, 0 to pi on the half circle."""
-    x, y = parameters["goal"]
-    return math.atan2(y, x)
 
 
 def goals_and_winds(parameters: Sequence[Parameters]) -> tuple[FloatArray, FloatArray]:
@@ -258,3 +253,52 @@ class PointRobotEnv(gymnasium.Env[FloatArray, FloatArray]):
             bool(step.truncated[0]),
             {name: array[0] for name, array in step.extras.items()},
         )
+
+
+@final
+class PointRobotCamera(FigureCamera):
+    """Draws the plane of one task; `reward_radius` as of `draw_task`."""
+
+    def __init__(
+        self, parameters: Parameters, *, reward_radius: float | None, width: int, height: int
+    ) -> None:
+        super().__init__(width, height)
+        self._parameters, self._radius, self._shape = parameters, reward_radius, height / width
+
+    def draw(self, axes: "Axes", observations: FloatArray) -> None:
+        draw_task(axes, self._parameters, reward_radius=self._radius)
+        axes.plot(observations[:, 0], observations[:, 1], ".-", color="tab:blue", markersize=3, linewidth=1)
+        axes.plot(*observations[-1], "o", color="tab:blue", markersize=6)
+        farthest = np.abs((observations - CENTER) / (1.0, self._shape)).max()
+        half = max(WIDTH / 2, 1.05 * float(farthest))
+        axes.set_xlim(CENTER[0] - half, CENTER[0] + half)
+        axes.set_ylim(CENTER[1] - self._shape * half, CENTER[1] + self._shape * half)
+
+
+def draw_task(
+    axes: "Axes", parameters: Parameters, *, reward_radius: float | None, color: str = "tab:green"
+) -> None:
+    """Draws start, goal and wind of a task, and the half circle if the goal lies on it.
+
+    Args:
+        axes: where to draw.
+        parameters: goal and wind of the task.
+        reward_radius: distance to the goal within which there is a reward; None if it is everywhere.
+        color: of the goal.
+    """
+    from matplotlib.patches import Circle
+
+    goal, wind = np.array(parameters["goal"]), np.array(parameters["wind"])
+    if not wind.any():
+        angles = np.linspace(0.0, np.pi, 100)
+        axes.plot(np.cos(angles), np.sin(angles), ":", color="0.7", linewidth=1)
+    if reward_radius is not None:
+        axes.add_patch(Circle((goal[0], goal[1]), reward_radius, color=color, alpha=0.2, linewidth=0))
+    axes.plot(0.0, 0.0, "+", color="0.3", markersize=8)
+    axes.plot(*goal, "*", color=color, markersize=11)
+    if wind.any():
+        arrow = {"arrowstyle": "->", "color": "tab:red", "linewidth": 1.5}
+        x, y = WIND_AT + WIND_SCALE * wind
+        axes.annotate("", (x, y), WIND_AT, arrowprops=arrow)
+        side = "right" if wind[0] > 0 else "left"
+        axes.text(*WIND_AT, " wind ", color="tab:red", fontsize=8, ha=side, va="center")

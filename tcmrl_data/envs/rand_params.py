@@ -17,14 +17,11 @@ import math
 from collections.abc import Mapping
 from typing import Any, ClassVar, Literal, final
 
-import gymnasium
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.envs._simulation import SimulatedTask, simulation_fingerprint, squared_norm
-from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
-from tcmrl_data.envs.camera import Camera
-from tcmrl_data.envs.controller import View
+from tcmrl_data.envs.base import EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, squared_norm
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import TaskError
 
@@ -52,7 +49,7 @@ class RandParamsSettings(EnvironmentSettings):
     constants: Literal["recomputed", "nominal"] = "recomputed"
 
 
-class _RandParams(Environment):
+class _RandParams(SimulatedEnvironment):
     """Base class of both robots; `shapes` lists the scaled model arrays in the order of drawing."""
 
     Settings = RandParamsSettings
@@ -78,14 +75,13 @@ class _RandParams(Environment):
         self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
     ) -> "RandParamsTask":
         simulator = self.simulator()
-        simulator.model.opt.timestep = self.settings.timestep
         self._scale(simulator, parameters)
-        return RandParamsTask(
-            simulator,
-            horizon=self.settings.horizon,
-            observation_dim=self.observation_dim,
-            action_dim=self.action_dim,
-        )
+        return RandParamsTask(self, simulator)
+
+    def simulator(self) -> Any:
+        simulator = self.body()
+        simulator.model.opt.timestep = self.settings.timestep
+        return simulator
 
     def _scale(self, simulator: Any, parameters: Parameters) -> None:
         for name, shape in self.shapes.items():
@@ -99,22 +95,11 @@ class _RandParams(Environment):
 
             mujoco.mj_setConst(simulator.model, simulator.data)
 
-    def camera(
-        self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
-    ) -> Camera:
-        assert isinstance(task, RandParamsTask)
-        return task.camera("track", width=width, height=height)
-
     def fingerprint(self) -> dict[str, Any]:
-        simulator = self.simulator()
-        try:
-            simulator.model.opt.timestep = self.settings.timestep
-            return simulation_fingerprint(simulator) | {"constants": self.settings.constants}
-        finally:
-            simulator.close()
+        return super().fingerprint() | {"constants": self.settings.constants}
 
     @abc.abstractmethod
-    def simulator(self) -> Any:
+    def body(self) -> Any:
         """Makes Gymnasium's environment with the nominal body."""
 
 
@@ -125,7 +110,6 @@ class HopperRandParams(_RandParams):
     name = "hopper-rand-params"
     observation_dim = 11
     action_dim = 3
-    simulator_bytes = 2 * 2**20
     shapes: ClassVar = {
         "body_mass": (5,),
         "body_inertia": (5, 3),
@@ -133,7 +117,7 @@ class HopperRandParams(_RandParams):
         "geom_friction": (5, 3),
     }
 
-    def simulator(self) -> Any:
+    def body(self) -> Any:
         from gymnasium.envs.mujoco.hopper_v5 import HopperEnv
 
         return HopperEnv()
@@ -146,7 +130,6 @@ class WalkerRandParams(_RandParams):
     name = "walker-rand-params"
     observation_dim = 17
     action_dim = 6
-    simulator_bytes = 2 * 2**20
     shapes: ClassVar = {
         "body_mass": (8,),
         "body_inertia": (8, 3),
@@ -154,7 +137,7 @@ class WalkerRandParams(_RandParams):
         "geom_friction": (8, 3),
     }
 
-    def simulator(self) -> Any:
+    def body(self) -> Any:
         from gymnasium.envs.mujoco.walker2d_v5 import Walker2dEnv
 
         return Walker2dEnv()

@@ -1,14 +1,25 @@
 """The environment loop of all rollouts, of behavior policies in builds and learned policies in evaluation."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any, final
 
 import numpy as np
+import numpy.typing as npt
 
 from tcmrl_data.envs.base import Environment, Lanes
 from tcmrl_data.envs.controller import Controller, Transition
-from tcmrl_data.envs.recorder import Recorder
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.trajectory import BoolArray, FloatArray, Trajectory
+
+STEP_ARRAYS: Mapping[str, type[np.generic]] = {
+    "actions": np.float32,
+    "rewards": np.float32,
+    "terminated": np.bool_,
+    "truncated": np.bool_,
+    "active": np.bool_,
+}
+"""Recorded arrays of a transition and their dtypes."""
 
 
 def roll_out(
@@ -61,3 +72,79 @@ def roll_out(
         if not active.any():
             break
     return recorder.trajectories()
+
+
+def hidden_entries(environment: Environment) -> BoolArray:
+    """(observation_dim,), entries of full observations that the stored view hides."""
+    shown = np.ones(environment.observation_dim)
+    found: BoolArray = environment.stored_view(shown) != shown
+    return found
+
+
+def first_observation(environment: Environment, task: Task) -> FloatArray:
+    """(observation_dim,), the full observation after a reset; hidden entries tell the task."""
+    lanes = environment.lanes([task.parameters])
+    try:
+        found: FloatArray = lanes.reset([0])[0]
+        return found
+    finally:
+        lanes.close()
+
+
+@final
+class Recorder:
+    """Collects the transitions of one episode per lane in memory; `DatasetRecorder` writes a dataset.
+
+    Example:
+        >>> import numpy as np
+        >>> zeros, active = np.zeros((2, 3)), np.array([True, True])
+        >>> step = Transition(zeros, zeros[:, :1], np.ones(2), zeros, ~active, ~active, active)
+        >>> recorder = Recorder()
+        >>> recorder.record(step)
+        >>> [len(trajectory) for trajectory in recorder.trajectories()]
+        [1, 1]
+    """
+
+    def __init__(self) -> None:
+        self._observations: list[npt.NDArray[np.float32]] = []
+        self._steps: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in STEP_ARRAYS}
+        self._extras: dict[str, list[npt.NDArray[Any]]] = {}
+
+    def record(
+        self, transition: Transition, extras: Mapping[str, npt.NDArray[np.generic]] | None = None
+    ) -> None:
+        """Adds a copy of one step of all lanes.
+
+        Args:
+            transition: the step.
+            extras: further arrays of shape (lanes,), with the same names in every step.
+        """
+        if not self._observations:
+            self._observations.append(transition.observations.astype(np.float32))
+        self._observations.append(transition.next_observations.astype(np.float32))
+        for name, kind in STEP_ARRAYS.items():
+            self._steps[name].append(getattr(transition, name).astype(kind))
+        for name, array in (extras or {}).items():
+            self._extras.setdefault(name, []).append(array.copy())
+
+    def trajectories(self) -> list[Trajectory]:
+        """The steps recorded so far, one float32 trajectory per lane; empty before the first step.
+
+        A lane's trajectory ends with its episode.
+        """
+        if not self._observations:
+            return []
+        observations = np.stack(self._observations, axis=1)
+        steps = {name: np.stack(arrays, axis=1) for name, arrays in self._steps.items()}
+        extras = {name: np.stack(arrays, axis=1) for name, arrays in self._extras.items()}
+        return [
+            Trajectory(
+                observations[lane, : length + 1],
+                steps["actions"][lane, :length],
+                steps["rewards"][lane, :length],
+                steps["terminated"][lane, :length],
+                steps["truncated"][lane, :length],
+                {name: array[lane, :length] for name, array in extras.items()},
+            )
+            for lane, length in enumerate(steps["active"].sum(axis=1))
+        ]

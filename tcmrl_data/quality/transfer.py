@@ -8,14 +8,8 @@ import numpy as np
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.selection import chosen_parts
 from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.controller import Controller
-from tcmrl_data.envs.fixed import (
-    BelievingController,
-    DeterministicController,
-    first_observation,
-    hidden_entries,
-)
-from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.controller import BelievingController, Controller, DeterministicController
+from tcmrl_data.envs.rollout import first_observation, hidden_entries, roll_out
 from tcmrl_data.envs.tasks import Split, Task, in_order
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import SelectionError

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from tcmrl_data.envs.camera import Picture
+from tcmrl_data.envs.base import Picture
 
 BAR, LEAST_BAR = 0.056, 14
 """Height of a line of words as a share of the width of a frame, and its least in pixels."""

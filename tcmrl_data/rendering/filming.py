@@ -7,11 +7,10 @@ from typing import final
 
 import numpy as np
 
-from tcmrl_data.envs._open_gl import check_chosen_kind
-from tcmrl_data.envs.base import Environment, EnvironmentLanes
-from tcmrl_data.envs.camera import Camera, Picture
+from tcmrl_data.envs.base import Camera, Environment, EnvironmentLanes, Picture
 from tcmrl_data.envs.controller import Controller, PlaybackController, Transition, View
 from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.simulation import check_chosen_open_gl
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import RenderingError, SimulationError
 from tcmrl_data.rendering.stored_episode import StoredEpisode
@@ -58,7 +57,7 @@ def film(
     steps = len(episode.trajectory)
     moments = np.linspace(0, steps, min(frames, steps + 1)).round().astype(int)
     if environment.simulator_bytes:
-        check_chosen_kind()
+        check_chosen_open_gl()
     with contextlib.ExitStack() as stack:
         task = environment.make(episode.parameters, view="full")
         lanes = stack.enter_context(contextlib.closing(EnvironmentLanes(environment, [task])))

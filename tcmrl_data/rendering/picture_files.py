@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from tcmrl_data.envs.camera import Picture
+from tcmrl_data.envs.base import Picture
 from tcmrl_data.foundation.errors import RenderingError
 
 ENDINGS = (".webp", ".png", ".mp4")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.envs.camera import Picture
+from tcmrl_data.envs.base import Picture
 from tcmrl_data.envs.tasks import place_in_order
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import RenderingError, SelectionError, SimulationError

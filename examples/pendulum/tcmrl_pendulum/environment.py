@@ -9,10 +9,15 @@ import gymnasium
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward
-from tcmrl_data.envs.camera import FigureCamera
-from tcmrl_data.envs.controller import View
-from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.envs.base import (
+    Environment,
+    EnvironmentSettings,
+    FigureCamera,
+    FloatArray,
+    Parameters,
+    Reward,
+    View,
+)
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
