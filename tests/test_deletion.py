@@ -26,9 +26,14 @@ def test_a_dataset_goes_and_foreign_files_stay(tmp_path: Path) -> None:
     outside = tmp_path / "outside.zip"
     outside.touch()
     (folder / "parts" / "main" / "00007" / "0000000.zip").symlink_to(outside)
+    (folder / "more").symlink_to(tmp_path)
     report = delete_dataset(folder)
-    assert report.kept == ("notes.txt", "parts/main/00007/0000000.zip", "parts/mine/x.zip")
-    left = sorted(path.relative_to(folder).as_posix() for path in folder.rglob("*") if not path.is_dir())
+    assert report.kept == ("more", "notes.txt", "parts/mine/x.zip")
+    left = sorted(
+        path.relative_to(folder).as_posix()
+        for path in folder.rglob("*")
+        if path.is_symlink() or not path.is_dir()
+    )
     assert left == list(report.kept)
     assert outside.exists()
 

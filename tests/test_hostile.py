@@ -249,7 +249,10 @@ LINKS = {
     ),
     **dict.fromkeys((".staging", ".checkpoints", ".staging/repair", ".checkpoints/task_00000"), ""),
 }
-"""Work files and folders, and where a stranger's links in their places lead."""
+"""Work files and folders, and where a stranger's links in their places lead.
+
+Links in the places of files are replaced by files; a folder that is a link is refused.
+"""
 
 
 @pytest.mark.parametrize("name", LINKS)
@@ -258,7 +261,7 @@ def test_nothing_is_written_through_a_link(forge: Forge, name: str, command: str
     (forge.folder / name).parent.mkdir(parents=True, exist_ok=True)
     (forge.folder / name).symlink_to(forge.outside / LINKS[name])
     before = files_of(forge.outside)
-    with pytest.raises(TcmrlError, match=name):
+    with contextlib.nullcontext() if LINKS[name] else pytest.raises(TcmrlError, match=name):
         WRITERS[command](forge.folder)
     assert files_of(forge.outside) == before
 

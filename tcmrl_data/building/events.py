@@ -15,7 +15,15 @@ from pathlib import Path
 from typing import Any, Literal
 
 from tcmrl_data.building.history import History, is_number, is_summary
-from tcmrl_data.foundation.disk import LOCK, STAGING, lock_holder, move_into_place, named_errors, replace_file
+from tcmrl_data.foundation.disk import (
+    LOCK,
+    STAGING,
+    lock_holder,
+    make_own,
+    move_into_place,
+    named_errors,
+    replace_file,
+)
 from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.store.manifest import Manifest, dataset_folder, read_manifest
 
@@ -113,6 +121,7 @@ class EventLog:
         os.close(full)
 
     def _open(self) -> None:
+        make_own(self._path, num_bytes=EVENTS_BYTES, staging=self._dataset / STAGING)
         self._file = os.open(self._path, os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_NOFOLLOW, 0o644)
         self._size = os.fstat(self._file).st_size
         if self._size and os.pread(self._file, 1, self._size - 1) != b"\n":

@@ -17,7 +17,7 @@ from tcmrl_data.foundation.errors import (
     UnreadableError,
 )
 from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.foundation.plain_files import file_problem, folder_problem
+from tcmrl_data.foundation.plain_files import file_problem, folder_problem, status_of
 from tcmrl_data.foundation.shared_folder import wait_until_visible
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
@@ -273,7 +273,7 @@ class Ledger:
         """The keys and sizes of all archives in the folders of the wanted tasks.
 
         Raises:
-            StoreError: a folder or an archive is a link or something else that no build makes.
+            StoreError: a folder or an archive is something that no build makes.
         """
         for task in self._steps:
             place = part_folder(PartKey(task, 0))
@@ -286,7 +286,7 @@ class Ledger:
                 for entry in entries:
                     key = key_of_file(f"{place}/{entry.name}")
                     if key is not None:
-                        status = entry.stat(follow_symlinks=False)
+                        status = status_of(entry)
                         problem = file_problem(status)
                         if problem:
                             raise StoreError(f"{self._out / place / entry.name} {problem}; delete it")

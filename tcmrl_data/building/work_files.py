@@ -35,7 +35,10 @@ DESCRIPTIONS = {CARD} | CROISSANT_FILES
 
 
 def check_work_files(folder: Path, *, but: Collection[str] = ()) -> None:
-    """Refuses a dataset whose work files, or anything in its work folders, would lead writing out of it.
+    """Refuses a dataset whose work files are none, or whose work folders would lead writing out of it.
+
+    Files that are links are replaced when they are written, and may be any links; `parts` may be a link to a
+    folder on another disk.
 
     Args:
         folder: the dataset.
@@ -46,8 +49,8 @@ def check_work_files(folder: Path, *, but: Collection[str] = ()) -> None:
     """
     for name in sorted((WORK_FILES | WORK_FOLDERS | TABLES | {PARTS}) - {*but}):
         try:
-            status = (folder / name).lstat()
-        except FileNotFoundError:
+            status = (folder / name).stat(follow_symlinks=name not in WORK_FOLDERS)
+        except OSError:  # it is not there, or a link to nothing
             continue
         is_folder = stat.S_ISDIR(status.st_mode)
         is_file = name in WORK_FILES | TABLES
@@ -58,14 +61,14 @@ def check_work_files(folder: Path, *, but: Collection[str] = ()) -> None:
 
 
 def _check_work_folder(folder: Path) -> None:
-    """Refuses links, pipes and devices at any depth of a folder; others may change it meanwhile."""
+    """Refuses links to folders, pipes and devices at any depth; others may change the folder meanwhile."""
     waiting = [folder]
     while waiting:
         with contextlib.suppress(FileNotFoundError), os.scandir(waiting.pop()) as entries:
             for entry in entries:
                 if entry.is_dir(follow_symlinks=False):
                     waiting.append(Path(entry.path))
-                elif not entry.is_file(follow_symlinks=False) and os.path.lexists(entry.path):
+                elif not entry.is_file() and os.path.exists(entry.path):
                     raise BuildError(f"{entry.path} is no plain file or folder; delete it")
 
 

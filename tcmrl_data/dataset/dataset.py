@@ -22,10 +22,10 @@ from tcmrl_data.foundation.errors import (
     StoreError,
     TrajectoryError,
 )
-from tcmrl_data.foundation.plain_files import folder_problem, one_line, read_plain_file
+from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
-from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file, part_folder
+from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import Manifest, dataset_folder, read_manifest
 from tcmrl_data.store.part_files import check_members
 from tcmrl_data.store.part_record import PartRecord, read_part_record
@@ -93,12 +93,11 @@ class Dataset(Tables):
 
         Raises:
             SelectionError: the dataset has no such part.
-            StoreError: the archive is missing, damaged, or reached through a link.
+            StoreError: the archive is missing or damaged.
         """
         entry, file = self.entry(key), self.file_of(key)
-        problem = folder_problem(self.folder, part_folder(key))
         try:
-            data = b"" if problem else read_plain_file(file, limit=entry.size)
+            data = read_plain_file(file, limit=entry.size)
         except (OSError, ValueError) as error:
             raise StoreError(f"{file}: {one_line(error)}; run `tcmrl-data repair`") from None
         if sha256(data) != entry.sha256:
@@ -110,14 +109,9 @@ class Dataset(Tables):
 
         Raises:
             SelectionError: the dataset has no such part.
-            StoreError: the archive is missing, damaged, of another size, or reached through a link.
+            StoreError: the archive is missing, damaged, or of another size.
         """
         entry = self.entry(key)
-        problem = folder_problem(self.folder, part_folder(key))
-        if problem:
-            raise StoreError(
-                f"{self.folder / problem[0]} {problem[1]}; run `tcmrl-data repair {self.folder}`"
-            )
         archive = Archive(self.file_of(key))
         if archive.size != entry.size:
             archive.close()

@@ -4,6 +4,7 @@ import functools
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from pydantic import ValidationError
 
 from tcmrl_data.dataset.view import View
@@ -86,7 +87,8 @@ class Tables:
         """The dataset's parts, as its table describes them.
 
         Raises:
-            ManifestError: the table of parts is not the one that the manifest seals, or has another root.
+            ManifestError: the table of parts is not the one that the manifest seals, has another root, or
+                names a task that the dataset does not have.
         """
         file = self.folder / PARTS_TABLE
         table = self.recorded_parts.without_tasks(self.manifest.dropped)
@@ -96,6 +98,8 @@ class Tables:
             raise ManifestError(f"{file}: its parts do not have the manifest's root; run `tcmrl-data verify`")
         if not set(table.runs) <= {run.name for run in self.manifest.runs}:
             raise ManifestError(f"{file}: names a run that the manifest does not have")
+        if not np.isin(table.columns["task"], [task.index for task in self.recorded_tasks]).all():
+            raise ManifestError(f"{file}: names a task that {TASKS} does not have")
         return table
 
     @functools.cached_property

@@ -5,6 +5,7 @@ import errno
 import os
 import shutil
 import stat
+import sys
 import tempfile
 import uuid
 from collections.abc import Iterable, Iterator, Mapping
@@ -14,6 +15,7 @@ from typing import IO, Any, TextIO
 
 from tcmrl_data.foundation.errors import LockedError, ReadOnlyError, StorageError
 from tcmrl_data.foundation.locks import is_locked, try_exclusive_lock
+from tcmrl_data.foundation.plain_files import open_plain_file
 
 STAGING = ".staging"
 LOCK = ".lock"
@@ -117,25 +119,58 @@ def sync_tree(folder: Path) -> None:
 def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> None:
     """Replaces a file atomically: readers see the old content or the new content.
 
+    A link in its place is replaced, not followed, and another name of the old file keeps the old content.
+
     Args:
         path: the file; missing parent folders are created.
         data: the new content.
-        staging: folder for the unfinished file; None writes a hidden file next to `path`.
+        staging: folder for the unfinished file; None, or a folder on another disk than the file's, writes a
+            hidden file next to `path`.
 
     Raises:
         StorageError: the operating system refuses the operation; the old file is unchanged.
     """
+    name = f"{path.name}.{uuid.uuid4().hex}"
+    places = [path.with_name(f".{name}")]
     if staging is not None:
         _make_staging(staging)
+        places.insert(0, staging / name)
     make_folders(path.parent)
-    temporary = (staging or path.parent) / f"{'' if staging else '.'}{path.name}.{uuid.uuid4().hex}"
+    with named_errors(path):
+        for temporary in places:
+            try:
+                write_file(temporary, data)
+                disk.rename(temporary, path)
+                break
+            except OSError as error:
+                if error.errno != errno.EXDEV or temporary is places[-1]:
+                    raise
+            finally:
+                temporary.unlink(missing_ok=True)
+        disk.sync(path.parent)
+
+
+def make_own(path: Path, *, num_bytes: int, staging: Path) -> None:
+    """Replaces a file by a copy of its first bytes if it is a link, or has other names (hard links).
+
+    What is then written into it changes no other file. A link to nothing is removed.
+
+    Raises:
+        StorageError: the operating system refuses an operation; the file is unchanged.
+    """
     with named_errors(path):
         try:
-            write_file(temporary, data)
-            disk.rename(temporary, path)
-        finally:
-            temporary.unlink(missing_ok=True)
-        disk.sync(path.parent)
+            status = path.lstat()
+        except FileNotFoundError:
+            return
+        if not stat.S_ISLNK(status.st_mode) and status.st_nlink == 1:
+            return
+        if not path.exists():
+            path.unlink()
+            return
+        with open_plain_file(path, limit=sys.maxsize) as shared:
+            data = shared.read(num_bytes)
+        replace_file(path, data, staging=staging)
 
 
 def place_file(path: Path, data: bytes, *, staging: Path) -> None:
@@ -267,6 +302,9 @@ def require_room(file: Path, num_bytes: int, *, remedy: str = GO_ON) -> None:
 def lock_file(path: Path, what: str) -> Iterator[Path]:
     """Holds an exclusive lock on a file that names its holder.
 
+    A link in its place is removed. A file with other names, as in a copy made of hard links, is locked as
+    one file in all places; where nobody holds it, this place gets a file of its own.
+
     Raises:
         LockedError: another process holds the lock; the message names that process.
         ReadOnlyError: the folder cannot be written.
@@ -278,7 +316,10 @@ def lock_file(path: Path, what: str) -> Iterator[Path]:
             is_ours = try_exclusive_lock(file)
         if not is_ours:
             raise LockedError(f"{what} is being written by {_holder(file)}; wait for it or stop it")
-        if not is_current(file, path):  # its last holder removed it after it was opened here
+        has_one_name = os.fstat(file.fileno()).st_nlink == 1
+        if not has_one_name or not is_current(file, path):  # or its last holder removed it meanwhile
+            if is_current(file, path):
+                path.unlink()
             stack.close()
             stack.enter_context(lock_file(path, what))
         else:
@@ -298,6 +339,8 @@ def is_current(file: IO[Any], path: Path) -> bool:
 
 def _open_lock(path: Path) -> TextIO:
     try:
+        if path.is_symlink():  # that of a stranger's dataset may lead anywhere
+            path.unlink()
         return open(path, "a+", opener=_open_no_link)
     except OSError as error:
         if error.errno not in (errno.EROFS, errno.EACCES, errno.EPERM):
@@ -308,7 +351,7 @@ def _open_lock(path: Path) -> TextIO:
 
 
 def _open_no_link(path: str, flags: int) -> int:
-    """Opens a file as `open` does, but no link: that of a stranger's dataset may lead anywhere."""
+    """Opens a file as `open` does, but no link."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 

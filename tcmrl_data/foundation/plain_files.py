@@ -1,4 +1,8 @@
-"""Reading untrusted files: regular files only, without following links, up to a size limit."""
+"""Reading files of strangers: regular files only, up to a size limit.
+
+Links and hard links to regular files are how people keep copies (`cp -al`, DVC, the Hub's cache), and are
+followed. What is no regular file is refused once it is open, before a byte of it is read.
+"""
 
 import os
 import stat
@@ -16,23 +20,28 @@ KINDS = {
 
 
 def file_problem(status: os.stat_result) -> str | None:
-    """Why a file with this `lstat` result must not be read; None for a regular file with one name.
+    """Why a file with this status must not be read; None for a regular file."""
+    if stat.S_ISREG(status.st_mode):
+        return None
+    if stat.S_ISLNK(status.st_mode):  # a link that is not followed, or could not be
+        return "is a link that leads to no file"
+    return f"is {KINDS.get(stat.S_IFMT(status.st_mode), 'something odd')}, not a plain file"
 
-    A file with hard links is refused, because a program can change it through a name outside the dataset.
-    Copying the dataset gives every file one name.
+
+def status_of(entry: os.DirEntry[str]) -> os.stat_result:
+    """The status of what an entry of a folder is or leads to; that of the link where it leads to nothing.
+
+    Raises:
+        FileNotFoundError: it was removed meanwhile.
     """
-    if not stat.S_ISREG(status.st_mode):
-        return f"is {KINDS.get(stat.S_IFMT(status.st_mode), 'something odd')}, not a plain file"
-    if status.st_nlink > 1:
-        return f"has {status.st_nlink} names (hard links); copy the dataset and use the copy"
-    return None
+    try:
+        return entry.stat()
+    except OSError:
+        return entry.stat(follow_symlinks=False)
 
 
 def read_plain_file(file: Path, *, limit: int) -> bytes:
-    """Reads a regular file.
-
-    Does not block on a FIFO, does not follow a link in the path's last component (`folder_problem` checks the
-    components before it), and allocates at most `limit` bytes.
+    """Reads a regular file, also through links; does not block on a FIFO.
 
     Args:
         file: the file.
@@ -53,21 +62,22 @@ def open_plain_file(file: Path, *, limit: int) -> BinaryIO:
         ValueError: not a regular file, or larger than the limit; the message does not name the file.
         OSError: the file is missing or cannot be opened.
     """
-    _require_plain(os.lstat(file), limit)
-    descriptor = os.open(file, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
-    try:
-        _require_plain(os.fstat(descriptor), limit)
-    except ValueError:
+    descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    status = os.fstat(descriptor)
+    problem = file_problem(status)
+    if problem is None and status.st_size > limit:
+        problem = f"has {status.st_size} bytes, more than the {limit} allowed here"
+    if problem is not None:
         os.close(descriptor)
-        raise
+        raise ValueError(problem)
     return os.fdopen(descriptor, "rb")
 
 
 def folder_problem(root: Path, folder: str) -> tuple[str, str] | None:
-    """Finds the first component of a relative path that is not a real folder.
+    """Finds the first component of a relative path that is neither a folder nor leads to one.
 
     Args:
-        root: trusted folder; its own path may contain links.
+        root: the folder that the path begins in.
         folder: path relative to `root`.
 
     Returns:
@@ -77,7 +87,7 @@ def folder_problem(root: Path, folder: str) -> tuple[str, str] | None:
     for name in Path(folder).parts:
         path = os.path.join(path, name)  # faster than Path; this runs for every file of a dataset
         try:
-            mode = os.lstat(os.path.join(root, path)).st_mode
+            mode = os.stat(os.path.join(root, path)).st_mode
         except OSError as error:
             return path, f"cannot be read ({error.strerror})"
         if not stat.S_ISDIR(mode):
@@ -103,11 +113,3 @@ def one_line(error: Exception) -> str:
 def words_after(error: Exception, file: Path) -> str:
     """An error's message without the file name at its start."""
     return str(error).removeprefix(str(file)).lstrip(": ")
-
-
-def _require_plain(status: os.stat_result, limit: int) -> None:
-    problem = file_problem(status)
-    if problem:
-        raise ValueError(problem)
-    if status.st_size > limit:
-        raise ValueError(f"has {status.st_size} bytes, more than the {limit} allowed here")

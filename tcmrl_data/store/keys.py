@@ -8,6 +8,7 @@ RUN_NAME = r"[a-z0-9_-]{1,64}"
 PARTS = "parts"
 """Folder of the parts' archives."""
 
+_PART_FOLDER = re.compile(rf"{PARTS}(?:/{RUN_NAME}(?:/[0-9]{{5,10}})?)?")
 _PART_FILE = re.compile(rf"{PARTS}/({RUN_NAME})/([0-9]{{5,10}})/([0-9]{{7,10}})\.zip")
 
 
@@ -36,6 +37,11 @@ def part_file(key: PartKey) -> str:
 def part_folder(key: PartKey) -> str:
     """Path of the folder that holds the archives of a task and run, relative to the dataset."""
     return f"{PARTS}/{key.run}/{key.task:05d}"
+
+
+def is_part_folder(path: str) -> bool:
+    """Whether a relative path is that of a folder of parts: of all, of a run or of a task."""
+    return _PART_FOLDER.fullmatch(path) is not None
 
 
 def key_of_file(path: str) -> PartKey | None:

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from tcmrl_data.foundation.disk import disk, named_errors
+from tcmrl_data.foundation.disk import STAGING, disk, make_own, named_errors
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, open_plain_file
 from tcmrl_data.store.limits import LINE_BYTES, MAX_COUNT
@@ -103,6 +103,7 @@ class TableWriter:
             StorageError: the operating system refuses the operation; the lines do not count then.
         """
         if lines:
+            self._make_own()
             hashed, seal = self._state[0].copy(), self._state[1]
             with named_errors(self._file):
                 disk.write_at(self._file, seal.bytes, lines)
@@ -120,6 +121,7 @@ class TableWriter:
         Raises:
             StorageError: the operating system refuses the operation.
         """
+        self._make_own()
         with named_errors(self._file):
             if self.has_more:
                 disk.truncate(self._file, self.seal.bytes)
@@ -127,6 +129,10 @@ class TableWriter:
             if not self._is_named:
                 disk.sync(self._file.parent)
         self._is_named = True
+
+    def _make_own(self) -> None:
+        """Keeps a copy of the dataset that shares the file by a link as it is."""
+        make_own(self._file, num_bytes=self.seal.bytes, staging=self._file.parent / STAGING)
 
     @property
     def seal(self) -> TableSeal:

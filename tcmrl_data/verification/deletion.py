@@ -16,7 +16,7 @@ from tcmrl_data.building.work_files import (
 )
 from tcmrl_data.foundation.disk import LOCK, disk, lock_file, lock_holder, named_errors, remove_tree
 from tcmrl_data.foundation.errors import LockedError, StoreError
-from tcmrl_data.store.keys import PARTS, key_of_file
+from tcmrl_data.store.keys import PARTS, is_part_folder, key_of_file
 from tcmrl_data.store.manifest import MANIFEST, dataset_folder, read_manifest
 from tcmrl_data.verification.scan import Scan, scan_dataset
 
@@ -71,9 +71,9 @@ def delete_dataset(path: str | Path, *, dry_run: bool = False) -> Deletion:
     if holder is not None:
         raise LockedError(f"dataset {folder} is being written by {holder}; wait for it or stop it")
     if dry_run:
-        return _deletion(folder, scan_dataset(folder))
+        return _deletion(folder, scan_dataset(folder, follow=False))
     with lock_file(folder / LOCK, f"dataset {folder}"), named_errors(folder):
-        scan = scan_dataset(folder)
+        scan = scan_dataset(folder, follow=False)
         _remove(folder, scan)
     return _deletion(folder, scan)
 
@@ -85,8 +85,10 @@ def _deletion(folder: Path, scan: Scan) -> Deletion:
 
 
 def _is_own(file: str, mode: int) -> bool:
-    """Whether a file is one that a dataset has: a plain file of such a name."""
-    return stat.S_ISREG(mode) and (
+    """Whether a file is one that a dataset has: a plain file of such a name, or a link in its place."""
+    if stat.S_ISLNK(mode) and is_part_folder(file):
+        return True
+    return stat.S_IFMT(mode) in (stat.S_IFREG, stat.S_IFLNK) and (
         file in {MANIFEST, *TABLES, *CROISSANT_FILES} or key_of_file(file) is not None
     )
 

@@ -38,7 +38,7 @@ class PartChecks:
 
         Args:
             file: its path relative to the dataset.
-            status: its `lstat`; None where it is missing.
+            status: its status; None where it is missing.
             entry: its line in the table; None where the table cannot tell.
         """
         if status is None:

@@ -1,4 +1,4 @@
-"""Lists everything in a dataset's folder without following links or opening files."""
+"""Lists everything in a dataset's folder without opening files."""
 
 import os
 import stat
@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_data.building.work_files import WORK_FILES, WORK_FOLDERS
-from tcmrl_data.foundation.plain_files import one_line
+from tcmrl_data.foundation.plain_files import one_line, status_of
+from tcmrl_data.store.keys import is_part_folder
 
 MAX_DEPTH = 10
 """Parts lie 3 folders deep."""
@@ -18,7 +19,7 @@ class Scan:
     """What lies in a folder, by relative path.
 
     Attributes:
-        files: `lstat` of everything that is no folder.
+        files: status of everything that is no folder, such as a link to a folder that parts do not lie in.
         empty_folders: folders that hold nothing.
         problems: folders that could not be listed, or lie too deep, and why.
     """
@@ -34,8 +35,13 @@ class Scan:
         yield from self.problems
 
 
-def scan_dataset(folder: Path) -> Scan:
-    """Lists a dataset, work files left out where they are of their kind."""
+def scan_dataset(folder: Path, *, follow: bool = True) -> Scan:
+    """Lists a dataset, work files left out where they are of their kind.
+
+    Args:
+        folder: the dataset.
+        follow: list what links in the places of parts and tables lead to; else the links themselves.
+    """
     scan = Scan({}, set(), {})
     waiting = [""]
     while waiting:
@@ -51,7 +57,9 @@ def scan_dataset(folder: Path) -> Scan:
         for entry in entries:
             path = f"{place}/{entry.name}" if place else entry.name
             try:
-                status = entry.stat(follow_symlinks=False)
+                status = status_of(entry) if follow else entry.stat(follow_symlinks=False)
+                if stat.S_ISDIR(status.st_mode) and entry.is_symlink() and not is_part_folder(path):
+                    status = entry.stat(follow_symlinks=False)  # it may lead to any folder, the root even
             except FileNotFoundError:  # a build has renamed or removed it meanwhile
                 continue
             is_folder = stat.S_ISDIR(status.st_mode)

@@ -63,17 +63,6 @@ def with_name(name: str) -> Damage:
     )
 
 
-def linked(name: str) -> Damage:
-    """A symbolic link to the original file, which is moved outside the dataset."""
-
-    def damage(forge: Forge) -> None:
-        path = forge.folder / name
-        path.rename(forge.outside / "moved")
-        path.symlink_to(forge.outside / "moved")
-
-    return damage
-
-
 def special_file(name: str, make: Callable[[Path], object]) -> Damage:
     def damage(forge: Forge) -> None:
         (forge.folder / name).unlink()
@@ -84,10 +73,6 @@ def special_file(name: str, make: Callable[[Path], object]) -> Damage:
 
 def device(path: Path) -> None:
     path.symlink_to("/dev/zero")
-
-
-def two_names(name: str) -> Damage:
-    return lambda forge: os.link(forge.folder / name, forge.outside / "same")
 
 
 def socket_file(path: Path) -> None:

@@ -4,38 +4,38 @@ import os
 from pathlib import Path
 
 from tcmrl_data.store.manifest import MANIFEST
-from tests.hostile.case import ESCAPE, device, in_file, linked, socket_file, special_file, two_names
-from tests.hostile.datasets import OTHER, PART
+from tests.hostile.case import ESCAPE, device, in_file, socket_file, special_file
+from tests.hostile.datasets import OTHER, PART, Forge
+
+
+def _looped(forge: Forge) -> None:
+    """A run that is a link to the folder of all runs, and so on for ever."""
+    (forge.folder / "parts/main").rename(forge.outside / "main")
+    (forge.folder / "parts/main").symlink_to(".")
+
 
 FILES = [
-    in_file("part linked", linked(PART), PART, "a link", "read"),
-    in_file("part linked to a device", special_file(PART, device), PART, "a link", "read"),
+    in_file("part linked to a device", special_file(PART, device), PART, "a character device", "read"),
     in_file(
         "part linked to nothing",
         special_file(PART, lambda p: p.symlink_to("/nothing")),
         PART,
-        "a link",
+        "",
         "read",
     ),
-    in_file(
-        "part linked to itself", special_file(PART, lambda p: p.symlink_to(p.name)), PART, "a link", "read"
-    ),
+    in_file("part linked to itself", special_file(PART, lambda p: p.symlink_to(p.name)), PART, "", "read"),
     in_file(
         "part linked to the other",
         special_file(PART, lambda p: p.symlink_to(f"../../../{OTHER}")),
         PART,
-        "a link",
+        "",
         "read",
     ),
-    in_file("task linked", linked("parts/main/00000"), "parts/main/00000", "a link", "read"),
-    in_file("run linked", linked("parts/main"), "parts/main", "a link", "read"),
-    in_file("parts linked", linked("parts"), "parts", "a link", "read"),
-    in_file("manifest linked", linked(MANIFEST), MANIFEST, "a link", "open"),
-    in_file("part of two names", two_names(PART), PART, "hard links", "read"),
-    in_file("manifest of two names", two_names(MANIFEST), MANIFEST, "hard links", "open"),
+    in_file("parts linked to themselves", _looped, PART, "", "read"),
+    in_file("manifest linked to a device", special_file(MANIFEST, device), MANIFEST, "device", "open"),
     in_file("part a FIFO", special_file(PART, os.mkfifo), PART, "a FIFO", "read"),
     in_file("manifest a FIFO", special_file(MANIFEST, os.mkfifo), MANIFEST, "a FIFO", "open"),
-    in_file("part a socket", special_file(PART, socket_file), PART, "a socket", "read"),
+    in_file("part a socket", special_file(PART, socket_file), PART, "", "read"),
     in_file("part a folder", special_file(PART, Path.mkdir), PART, "", "read"),
     in_file("part missing", lambda f: f.part.unlink(), PART, "missing", "read"),
     in_file(
@@ -70,7 +70,11 @@ FILES = [
         "150.zip",
         "no part",
     ),
+    in_file("lock linked to a device", lambda f: device(f.folder / ".lock"), ".lock", "a character device"),
     in_file(
-        "lock linked", lambda f: (f.folder / ".lock").symlink_to(f.outside / "secret"), ".lock", "a link"
+        "a link to a folder beside the data",
+        lambda f: (f.folder / "more").symlink_to(f.outside),
+        "more",
+        "a link",
     ),
 ]

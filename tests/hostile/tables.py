@@ -15,10 +15,8 @@ from tests.hostile.case import (
     Stage,
     device,
     in_file,
-    linked,
     socket_file,
     special_file,
-    two_names,
     with_field,
     with_name,
     with_recipe,
@@ -64,11 +62,9 @@ def _cell(column: str, value: Any, row: int = 0) -> Damage:
 
 TASK_TABLES = [
     _tasks("missing", lambda f: (f.folder / TASKS).unlink(), "missing"),
-    _tasks("linked", linked(TASKS), "a link"),
-    _tasks("linked to a device", special_file(TASKS, device), "a link"),
-    _tasks("of two names", two_names(TASKS), "hard links"),
+    _tasks("linked to a device", special_file(TASKS, device), "a character device"),
     _tasks("a FIFO", special_file(TASKS, os.mkfifo), "a FIFO"),
-    _tasks("a socket", special_file(TASKS, socket_file), "a socket"),
+    _tasks("a socket", special_file(TASKS, socket_file), "No such device"),
     _tasks("a folder", special_file(TASKS, Path.mkdir), "a folder"),
     _tasks("truncated", _raw(TASKS, lambda data: data[:-1]), "manifest seals"),
     _tasks("empty", _raw(TASKS, lambda data: b""), "manifest seals"),
@@ -129,11 +125,9 @@ TASK_TABLES = [
 
 PART_TABLES = [
     _parts("missing", lambda f: (f.folder / PARTS_TABLE).unlink(), "missing"),
-    _parts("linked", linked(PARTS_TABLE), "a link"),
-    _parts("linked to a device", special_file(PARTS_TABLE, device), "a link"),
-    _parts("of two names", two_names(PARTS_TABLE), "hard links"),
+    _parts("linked to a device", special_file(PARTS_TABLE, device), "a character device"),
     _parts("a FIFO", special_file(PARTS_TABLE, os.mkfifo), "a FIFO"),
-    _parts("a socket", special_file(PARTS_TABLE, socket_file), "a socket"),
+    _parts("a socket", special_file(PARTS_TABLE, socket_file), "No such device"),
     _parts("a folder", special_file(PARTS_TABLE, Path.mkdir), "a folder"),
     _parts("truncated", _raw(PARTS_TABLE, lambda data: data[:-1]), "manifest seals"),
     _parts("empty", _raw(PARTS_TABLE, lambda data: b""), "manifest seals"),
@@ -199,7 +193,7 @@ PLACES = [
     in_file("mean edited in the table", _cell("mean", 1e9), PART, "statistics.mean"),
     in_file("success of nothing", _cell("success_rate", 1.0), PART, "statistics.success_rate"),
     in_file(
-        "another task in the table", _cell("task", 99, row=1), "parts/main/00099", "cannot be read", "read"
+        "another task in the table", _cell("task", 99, row=1), PARTS_TABLE, "names a task that", "tables"
     ),
     in_file("another step", _cell("step", 7), "0000007.zip", "is missing", "read"),
     in_file(
