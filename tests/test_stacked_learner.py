@@ -13,19 +13,27 @@ from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from torch import Tensor
 
 from tcmrl_data import load_recipe
-from tcmrl_data.behavior.stacked.learner import (
-    Hyperparameters,
+from tcmrl_data.behavior.sac import SacSettings
+from tcmrl_data.behavior.stacked_learner import (
     ReplayBatch,
+    StackedNetwork,
     StackedSac,
     head_gradient,
     sample_policy,
 )
-from tcmrl_data.behavior.stacked.networks import StackedNetwork
 
 CPU = torch.device("cpu")
 OBSERVATION_DIM, ACTION_DIM, BATCH = 5, 3, 32
-SETTINGS = Hyperparameters(
-    hidden=(24, 16), learning_rate=1e-3, batch_size=BATCH, gamma=0.95, tau=0.02, entropy=None
+SETTINGS = SacSettings(
+    hidden=(24, 16),
+    steps=1,
+    warmup=0,
+    snapshots=(0, 1),
+    learning_rate=1e-3,
+    batch_size=BATCH,
+    gamma=0.95,
+    tau=0.02,
+    buffer_size=1,
 )
 
 
@@ -38,7 +46,7 @@ def one_torch_thread() -> Iterator[None]:
     torch.set_num_threads(threads)
 
 
-def learner(num_agents: int, settings: Hyperparameters = SETTINGS, device: torch.device = CPU) -> StackedSac:
+def learner(num_agents: int, settings: SacSettings = SETTINGS, device: torch.device = CPU) -> StackedSac:
     made = StackedSac(num_agents, OBSERVATION_DIM, ACTION_DIM, settings=settings, device=device)
     for agent in range(num_agents):
         generator = torch.Generator().manual_seed(agent)
@@ -127,7 +135,7 @@ class Box(gymnasium.Env[np.ndarray, np.ndarray]):
     action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_DIM,), np.float32)
 
 
-def sb3_model(settings: Hyperparameters) -> SAC:
+def sb3_model(settings: SacSettings) -> SAC:
     model = SAC(
         "MlpPolicy",
         Box(),
@@ -135,7 +143,7 @@ def sb3_model(settings: Hyperparameters) -> SAC:
         buffer_size=1,
         gamma=settings.gamma,
         tau=settings.tau,
-        ent_coef="auto" if settings.entropy is None else settings.entropy,
+        ent_coef=settings.entropy,
         policy_kwargs={"net_arch": list(settings.hidden)},
         seed=3,
         device="cpu",
@@ -169,12 +177,10 @@ def stacked_layers(made: StackedSac, agent: int) -> dict[str, list[Tensor]]:
     }
 
 
-@pytest.mark.parametrize("entropy", [None, 0.2])
-def test_a_lone_agent_follows_stable_baselines3(entropy: float | None) -> None:
+@pytest.mark.parametrize("entropy", ["auto", 0.2])
+def test_a_lone_agent_follows_stable_baselines3(entropy: float | str) -> None:
     """Same weights, batches and noise: after 100 updates every parameter agrees to 1e-5."""
-    settings = Hyperparameters(
-        hidden=(24, 16), learning_rate=1e-3, batch_size=BATCH, gamma=0.95, tau=0.02, entropy=entropy
-    )
+    settings = SETTINGS.model_copy(update={"entropy": entropy})
     model, made = sb3_model(settings), learner(1, settings)
     for name, tensors in stacked_layers(made, 0).items():
         for ours, theirs in zip(tensors, sb3_layers(model)[name], strict=True):
@@ -199,7 +205,7 @@ def test_a_lone_agent_follows_stable_baselines3(entropy: float | None) -> None:
     for name, tensors in stacked_layers(made, 0).items():
         for ours, other in zip(tensors, theirs[name], strict=True):
             torch.testing.assert_close(ours, other, rtol=0, atol=1e-5)
-    if entropy is None:
+    if entropy == "auto":
         assert model.log_ent_coef is not None
         torch.testing.assert_close(made.log_entropy, model.log_ent_coef.detach(), rtol=0, atol=1e-5)
         assert made.log_entropy.item() < -0.05

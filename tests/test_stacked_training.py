@@ -16,8 +16,8 @@ from tcmrl_data import Recipe, load_recipe, open_dataset
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.behavior.stacked.source import StackedSettings, StackedSource, _make_training
-from tcmrl_data.behavior.stacked.training import GroupTraining
+from tcmrl_data.behavior.stacked import StackedSettings, StackedSource
+from tcmrl_data.behavior.stacked_training import GroupTraining
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.plan import BuildPlan, plan_build
 from tcmrl_data.building.unit import UnitSpec, run_unit
@@ -98,7 +98,7 @@ def test_what_a_task_draws_and_learns_does_not_depend_on_its_group(tmp_path: Pat
     """Replay rows of the warm-up and batch positions are equal; the policies differ by rounding at most."""
     recipe = recipe_of()
     alone, together = (
-        _make_training(settings_of(recipe), context_of(recipe, tasks, tmp_path))
+        GroupTraining(context_of(recipe, tasks, tmp_path), settings_of(recipe))
         for tasks in ([3], [0, 2, 3, 7])
     )
     for training in (alone, together):
@@ -336,11 +336,11 @@ def test_the_others_of_a_diverged_agents_group_go_on_from_their_checkpoint(
 @pytest.mark.usefixtures("poisoned")
 def test_a_diverged_agent_reaches_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     recipe = recipe_of()
-    ill = _make_training(settings_of(recipe), context_of(recipe, [1, 2, 3], tmp_path))
+    ill = GroupTraining(context_of(recipe, [1, 2, 3], tmp_path), settings_of(recipe))
     for _ in range(130):
         ill.advance()
     monkeypatch.undo()
-    healthy = _make_training(settings_of(recipe), context_of(recipe, [1, 2, 3], tmp_path))
+    healthy = GroupTraining(context_of(recipe, [1, 2, 3], tmp_path), settings_of(recipe))
     for _ in range(130):
         healthy.advance()
     assert [ill.snapshot(agent).digest() == healthy.snapshot(agent).digest() for agent in range(3)] == [

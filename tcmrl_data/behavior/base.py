@@ -1,4 +1,7 @@
-"""Base class of behavior sources, which make the policies whose rollouts a dataset holds."""
+"""What a behavior source of another package needs; sources make the policies whose rollouts a dataset holds.
+
+Snapshots and checkpoints have files of their own; their names stand here too.
+"""
 
 import abc
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -7,12 +10,26 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel
 
-from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.envs.base import Environment, Reward
-from tcmrl_data.envs.controller import View
+from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
+from tcmrl_data.behavior.snapshot import GaussianDescription, ScriptedDescription, Snapshot
+from tcmrl_data.envs.base import Environment, Reward, View
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.plugins import Registry
+
+__all__ = [
+    "BEHAVIOR_SOURCES",
+    "BehaviorContext",
+    "BehaviorSource",
+    "CheckpointFolder",
+    "Environment",
+    "GaussianDescription",
+    "Reward",
+    "ScriptedDescription",
+    "Snapshot",
+    "Task",
+    "TrainingState",
+    "View",
+]
 
 
 @dataclass(frozen=True)

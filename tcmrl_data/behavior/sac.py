@@ -1,14 +1,21 @@
-"""The source `sac`: one Stable-Baselines3 SAC per task."""
+"""The source `sac`: one Stable-Baselines3 SAC per task.
 
+SB3's `save` omits the replay buffer and the random generators, and its `load` seeds them again. With the
+state that `capture` takes at the start of an episode, a training continues bit for bit.
+"""
+
+import random
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import TYPE_CHECKING, Annotated, Any, Literal, SupportsFloat, final
 
 import gymnasium
+import numpy as np
+import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data.behavior._sac_state import capture, restore
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
+from tcmrl_data.behavior.checkpoints import TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot, snapshot_of_sac
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
@@ -16,9 +23,12 @@ from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 
 if TYPE_CHECKING:
     from stable_baselines3 import SAC
+    from torch.optim import Optimizer
 
 REPORT_EVERY = 100
 """Updates between two reports of progress."""
+
+REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 class SacSettings(BaseModel):
@@ -62,12 +72,9 @@ class SacSettings(BaseModel):
         return self
 
 
-@final
-class SacSource(BehaviorSource):
-    """Trains the tasks of a unit one after another."""
+class SacTraining(BehaviorSource):
+    """Base class of the sources that train SAC agents, alone or together."""
 
-    name = "sac"
-    Settings = SacSettings
     settings: SacSettings
 
     @property
@@ -82,12 +89,42 @@ class SacSource(BehaviorSource):
     def warmup_steps(self) -> int:
         return self.settings.warmup
 
-    def with_warmup(self, steps: int) -> "SacSource":
+    def with_warmup(self, steps: int) -> "SacTraining":
         warmup = min(steps, self.settings.warmup)
-        return SacSource(self.settings.model_copy(update={"warmup": warmup}))
+        return type(self)(self.settings.model_copy(update={"warmup": warmup}))
+
+    def agents_bytes(self, environment: Environment, *, num_agents: int) -> int:
+        """Maximum memory in bytes for training `num_agents` agents at the same time.
+
+        The content of a checkpoint (replay buffers, weights and moments) counts three times: as the
+        training's state, as the checkpoint and as the file's bytes.
+        """
+        settings = self.settings
+        observation_dim, action_dim = environment.observation_dim, environment.action_dim
+        row = 2 * observation_dim + action_dim + 3
+        replay = min(settings.buffer_size, settings.steps) * row
+        actor = _parameters(observation_dim, settings.hidden, 2 * action_dim)
+        critic = _parameters(observation_dim + action_dim, settings.hidden, 1)
+        kept = replay + 3 * actor + 2 * 4 * critic  # weights and two moments; the critics' targets
+        gradients = actor + 2 * critic
+        # both critics, forward and backward
+        activations = 8 * settings.batch_size * (row + sum(settings.hidden))
+        return 4 * num_agents * (3 * kept + gradients + activations)
+
+
+def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
+    return sum((before + 1) * after for before, after in pairwise((inputs, *hidden, outputs)))
+
+
+@final
+class SacSource(SacTraining):
+    """Trains the tasks of a unit one after another."""
+
+    name = "sac"
+    Settings = SacSettings
 
     def training_bytes(self, environment: Environment, num_tasks: int) -> int:
-        return training_bytes(self.settings, environment, num_agents=1)
+        return self.agents_bytes(environment, num_agents=1)
 
     def snapshots(self, context: BehaviorContext) -> Iterator[tuple[Task, Snapshot]]:
         for task in context.tasks:
@@ -120,27 +157,6 @@ class SacSource(BehaviorSource):
                 context.report(chunk)
             if step > steps_done:
                 yield snapshot_of_sac(model, step=step, observation=context.observation)
-
-
-def training_bytes(settings: SacSettings, environment: Environment, *, num_agents: int) -> int:
-    """Maximum memory in bytes for training `num_agents` agents at the same time.
-
-    The content of a checkpoint (replay buffers, weights and moments) counts three times: as the training's
-    state, as the checkpoint and as the file's bytes.
-    """
-    observation_dim, action_dim = environment.observation_dim, environment.action_dim
-    row = 2 * observation_dim + action_dim + 3
-    replay = min(settings.buffer_size, settings.steps) * row
-    actor = _parameters(observation_dim, settings.hidden, 2 * action_dim)
-    critic = _parameters(observation_dim + action_dim, settings.hidden, 1)
-    kept = replay + 3 * actor + 2 * 4 * critic  # weights and two moments; the critics' targets
-    gradients = actor + 2 * critic
-    activations = 8 * settings.batch_size * (row + sum(settings.hidden))  # both critics, forward and backward
-    return 4 * num_agents * (3 * kept + gradients + activations)
-
-
-def _parameters(inputs: int, hidden: tuple[int, ...], outputs: int) -> int:
-    return sum((before + 1) * after for before, after in pairwise((inputs, *hidden, outputs)))
 
 
 def make_model(settings: SacSettings, environment: gymnasium.Env[Any, Any], *, seed: int) -> "SAC":
@@ -195,3 +211,106 @@ class KeyedResets(gymnasium.Wrapper[Any, Any, Any, Any]):
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         self.at_border = False
         return super().step(action)
+
+
+def capture(model: "SAC", episodes: KeyedResets) -> TrainingState:
+    """Captures the state of a model whose current episode has no step yet."""
+    import torch
+
+    buffer = model.replay_buffer
+    assert buffer is not None
+    rows = buffer.buffer_size if buffer.full else buffer.pos
+    arrays = {name: tensor.detach().numpy() for name, tensor in _tensors(model)}
+    arrays |= {f"replay.{name}": getattr(buffer, name)[:rows] for name in REPLAY_ARRAYS}
+    arrays["random.torch"] = torch.get_rng_state().numpy()
+    version, words, gauss = random.getstate()
+    legacy = np.random.get_state(legacy=False)
+    assert isinstance(legacy, dict)
+    values = {
+        "steps": model.num_timesteps,
+        "updates": model._n_updates,
+        "episode": episodes.episode,
+        "replay": {"position": buffer.pos, "full": buffer.full},
+        "random": {
+            "python": [version, list(words), gauss],
+            "numpy": _plain(legacy),
+            "actions": _plain(model.action_space.np_random.bit_generator.state),
+        },
+    }
+    return TrainingState(values, {name: np.ascontiguousarray(array) for name, array in arrays.items()})
+
+
+def restore(model: "SAC", episodes: KeyedResets, checkpoint: TrainingState) -> int:
+    """Restores a checkpoint into a new model; returns the number of environment steps done."""
+    import torch
+
+    values, arrays = checkpoint.values, checkpoint.arrays
+    buffer, environment = model.replay_buffer, model.env
+    assert buffer is not None
+    assert environment is not None
+    if values["updates"]:
+        _prepare_optimizers(model)
+    with torch.no_grad():
+        for name, tensor in _tensors(model):
+            tensor.copy_(torch.from_numpy(arrays[name]).reshape(tensor.shape))
+    for name in REPLAY_ARRAYS:
+        getattr(buffer, name)[: len(arrays[f"replay.{name}"])] = arrays[f"replay.{name}"]
+    buffer.pos, buffer.full = values["replay"]["position"], values["replay"]["full"]
+    model.num_timesteps, model._n_updates = values["steps"], values["updates"]
+    episodes.episode = values["episode"] - 1
+    model._last_obs = environment.reset()  # type: ignore[assignment]
+    model._last_episode_starts = np.ones((environment.num_envs,), dtype=bool)
+    version, words, gauss = values["random"]["python"]
+    random.setstate((version, tuple(words), gauss))
+    np.random.set_state(_unplain(values["random"]["numpy"]))
+    model.action_space.np_random.bit_generator.state = _unplain(values["random"]["actions"])
+    torch.set_rng_state(torch.from_numpy(arrays["random.torch"].copy()))
+    return model.num_timesteps
+
+
+def _optimizers(model: "SAC") -> dict[str, "Optimizer"]:
+    policy = model.policy
+    named = {"actor": policy.actor.optimizer, "critic": policy.critic.optimizer}
+    if model.ent_coef_optimizer is not None:
+        named["entropy"] = model.ent_coef_optimizer
+    return named
+
+
+def _tensors(model: "SAC") -> Iterator[tuple[str, Any]]:
+    """Names and tensors of all parameters and optimizer moments."""
+    yield from ((f"policy.{name}", tensor) for name, tensor in model.policy.state_dict().items())
+    if model.log_ent_coef is not None:
+        yield "log_entropy_coefficient", model.log_ent_coef
+    for name, optimizer in _optimizers(model).items():
+        for index, state in optimizer.state_dict()["state"].items():
+            yield from ((f"optimizer.{name}.{index}.{key}", value) for key, value in state.items())
+
+
+def _prepare_optimizers(model: "SAC") -> None:
+    """Creates the optimizers' moment tensors by a step with zero gradients."""
+    import torch
+
+    for optimizer in _optimizers(model).values():
+        for group in optimizer.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = torch.zeros_like(parameter)
+        optimizer.step()
+        optimizer.zero_grad()
+
+
+def _plain(value: Any) -> Any:
+    """A generator's state as JSON, with arrays as `{"uint32": [...]}`."""
+    if isinstance(value, dict):
+        return {key: _plain(member) for key, member in value.items()}
+    if isinstance(value, np.ndarray):
+        return {str(value.dtype): value.tolist()}
+    return value
+
+
+def _unplain(value: Any) -> Any:
+    if isinstance(value, dict):
+        if set(value) == {"uint32"}:
+            words: npt.NDArray[np.uint32] = np.array(value["uint32"], dtype=np.uint32)
+            return words
+        return {key: _unplain(member) for key, member in value.items()}
+    return value

@@ -86,6 +86,20 @@ class Snapshot:
     description: GaussianDescription | ScriptedDescription
     tensors: Mapping[str, npt.NDArray[np.float32]] = field(default_factory=dict)
 
+    @classmethod
+    def of_network(
+        cls, step: int, observation: View, tensors: Mapping[str, npt.NDArray[np.float32]]
+    ) -> "Snapshot":
+        """The snapshot of a Gaussian policy; its tensors say how wide it is."""
+        biases = [name for name in tensors if name.startswith("hidden.") and name.endswith(".bias")]
+        description = GaussianDescription(
+            observation=observation,
+            observation_dim=tensors["hidden.0.weight"].shape[1],
+            action_dim=tensors["mean.bias"].size,
+            hidden=tuple(tensors[f"hidden.{index}.bias"].size for index in range(len(biases))),
+        )
+        return cls(step, description, tensors)
+
     def digest(self) -> str:
         """The sha256 of the description and of every tensor's dtype, shape and bytes."""
         tensors = {
@@ -177,13 +191,7 @@ def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
         for name, layer in named.items()
         for kind in ("weight", "bias")
     }
-    description = GaussianDescription(
-        observation=observation,
-        observation_dim=int(tensors["hidden.0.weight"].shape[1]),
-        action_dim=int(tensors["mean.weight"].shape[0]),
-        hidden=tuple(tensors[f"hidden.{i}.bias"].size for i in range(len(layers))),
-    )
-    return Snapshot(step, description, tensors)
+    return Snapshot.of_network(step, observation, tensors)
 
 
 @final

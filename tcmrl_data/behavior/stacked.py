@@ -6,20 +6,17 @@ of the source `sac`. Only rounding may depend on the group.
 
 import contextlib
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any, Literal, final
+from typing import Any, Literal, final
 
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
-from tcmrl_data.behavior.sac import SacSettings, training_bytes
+from tcmrl_data.behavior.base import BehaviorContext
+from tcmrl_data.behavior.sac import SacSettings, SacTraining
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError
-
-if TYPE_CHECKING:
-    from tcmrl_data.behavior.stacked.training import GroupTraining
 
 REPORT_EVERY = 20
 """Environment steps of the group between two reports of progress and checks for a due checkpoint."""
@@ -42,7 +39,7 @@ class StackedSettings(SacSettings):
 
 
 @final
-class StackedSource(BehaviorSource):
+class StackedSource(SacTraining):
     """Trains all tasks of a unit together."""
 
     name = "stacked"
@@ -51,27 +48,11 @@ class StackedSource(BehaviorSource):
     settings: StackedSettings
 
     @property
-    def steps(self) -> tuple[int, ...]:
-        return self.settings.snapshots
-
-    @property
-    def training_steps(self) -> int:
-        return self.settings.steps
-
-    @property
     def group_size(self) -> int:
         return self.settings.group
 
-    @property
-    def warmup_steps(self) -> int:
-        return self.settings.warmup
-
-    def with_warmup(self, steps: int) -> "StackedSource":
-        warmup = min(steps, self.settings.warmup)
-        return StackedSource(self.settings.model_copy(update={"warmup": warmup}))
-
     def training_bytes(self, environment: Environment, num_tasks: int) -> int:
-        return training_bytes(self.settings, environment, num_agents=num_tasks)
+        return self.agents_bytes(environment, num_agents=num_tasks)
 
     def provenance(self) -> Mapping[str, Any]:
         settings = self.settings
@@ -87,9 +68,11 @@ class StackedSource(BehaviorSource):
         Raises:
             BuildError: the device does not exist; or, after the last snapshot, a task's training diverged.
         """
+        from tcmrl_data.behavior.stacked_training import GroupTraining
+
         checkpoints = context.checkpoints(context.tasks)
         diverged: dict[int, int] = {}
-        with contextlib.closing(_make_training(self.settings, context)) as training:
+        with contextlib.closing(GroupTraining(context, self.settings)) as training:
             checkpoint = checkpoints.load()
             steps_done = -1
             if checkpoint is not None:
@@ -140,30 +123,3 @@ def _matmul_error(rows: int, width: int, device: str) -> float:
     product = torch.bmm(left.to(device), right.to(device)).cpu().double()
     exact = torch.bmm(left.double(), right.double())
     return float((product - exact).abs().max() / exact.std())
-
-
-def _make_training(settings: StackedSettings, context: BehaviorContext) -> "GroupTraining":
-    """Makes the untrained agents of a group."""
-    import torch
-
-    from tcmrl_data.behavior.stacked.learner import Hyperparameters
-    from tcmrl_data.behavior.stacked.training import GroupTraining
-
-    if settings.device == "cuda" and not torch.cuda.is_available():
-        raise BuildError("behavior.stacked.device is 'cuda', but torch finds no CUDA device; use 'cpu'")
-    return GroupTraining(
-        context,
-        Hyperparameters(
-            hidden=settings.hidden,
-            learning_rate=settings.learning_rate,
-            batch_size=settings.batch_size,
-            gamma=settings.gamma,
-            tau=settings.tau,
-            entropy=None if settings.entropy == "auto" else settings.entropy,
-        ),
-        warmup=settings.warmup,
-        train_frequency=settings.train_frequency,
-        gradient_steps=settings.gradient_steps,
-        capacity=min(settings.buffer_size, settings.steps),
-        device=torch.device(settings.device),
-    )

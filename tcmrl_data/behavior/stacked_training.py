@@ -15,9 +15,11 @@ from torch import Tensor
 
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import TrainingState
-from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
-from tcmrl_data.behavior.stacked.learner import Hyperparameters, ReplayBatch, StackedSac
+from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.behavior.stacked import StackedSettings
+from tcmrl_data.behavior.stacked_learner import ReplayBatch, StackedSac
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
+from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 
 
@@ -123,37 +125,24 @@ class StackedReplay:
 
 @final
 class GroupTraining:
-    """N agents and their environments.
+    """N untrained agents and their environments.
 
-    Args:
-        context: the tasks and their environment.
-        settings: hyperparameters of the update.
-        warmup: uniform random steps before the first update.
-        train_frequency: environment steps between updates.
-        gradient_steps: gradient steps per update.
-        capacity: capacity of a replay buffer in transitions.
-        device: device of networks and replay buffers.
+    Raises:
+        BuildError: the device of the settings does not exist.
     """
 
-    def __init__(
-        self,
-        context: BehaviorContext,
-        settings: Hyperparameters,
-        *,
-        warmup: int,
-        train_frequency: int,
-        gradient_steps: int,
-        capacity: int,
-        device: torch.device,
-    ) -> None:
+    def __init__(self, context: BehaviorContext, settings: StackedSettings) -> None:
+        if settings.device == "cuda" and not torch.cuda.is_available():
+            raise BuildError("behavior.stacked.device is 'cuda', but torch finds no CUDA device; use 'cpu'")
         environment, tasks = context.environment, context.tasks
         dims = (environment.observation_dim, environment.action_dim)
-        self._context, self._settings, self._device = context, settings, device
-        self._warmup, self._train_frequency, self._gradient_steps = warmup, train_frequency, gradient_steps
-        self._dims = dims
+        self._context, self._settings, self._dims = context, settings, dims
+        self._device = torch.device(settings.device)
         self.steps = 0
-        self.learner = StackedSac(len(tasks), *dims, settings=settings, device=device)
-        self._replay = StackedReplay(len(tasks), capacity, dims, device)
+        self.learner = StackedSac(len(tasks), *dims, settings=settings, device=self._device)
+        self._replay = StackedReplay(
+            len(tasks), min(settings.buffer_size, settings.steps), dims, self._device
+        )
         for agent, generator in enumerate(self._generators(Purpose.BEHAVIOR)):
             self.learner.initialize(agent, functools.partial(_uniform, generator))
         self._acting = self._generators(Purpose.BEHAVIOR_ACTION)
@@ -175,13 +164,13 @@ class GroupTraining:
         next_observations, rewards, terminated = self._episodes.step(actions)
         self._replay.add(observations, actions, next_observations, rewards, terminated)
         self.steps += 1
-        if self.steps > self._warmup and self.steps % self._train_frequency == 0:
-            for _ in range(self._gradient_steps):
+        if self.steps > self._settings.warmup and self.steps % self._settings.train_frequency == 0:
+            for _ in range(self._settings.gradient_steps):
                 self.learner.update(*self._draw())
 
     def _act(self, observations: FloatArray) -> FloatArray:
         action_dim = self._dims[1]
-        if self.steps < self._warmup:
+        if self.steps < self._settings.warmup:
             actions = [generator.uniform(-1.0, 1.0, action_dim) for generator in self._acting]
             return np.stack(actions).astype(np.float32)
         noise = [generator.standard_normal(action_dim, dtype=np.float32) for generator in self._acting]
@@ -209,18 +198,12 @@ class GroupTraining:
             np.split(array, 2) for array in arrays[-1]
         )
         named |= {"mean": (mean_weight, mean_bias), "log_std": (log_std_weight, log_std_bias)}
-        description = GaussianDescription(
-            observation=self._context.observation,
-            observation_dim=self._dims[0],
-            action_dim=self._dims[1],
-            hidden=self._settings.hidden,
-        )
         tensors = {
             f"{name}.{kind}": array.copy()
             for name, pair in named.items()
             for kind, array in zip(("weight", "bias"), pair, strict=True)
         }
-        return Snapshot(self.steps, description, tensors)
+        return Snapshot.of_network(self.steps, self._context.observation, tensors)
 
     def capture(self, *, failed: Mapping[int, int]) -> TrainingState:
         """Captures the complete state of the training, at any step.
