@@ -1,6 +1,6 @@
-"""What a behavior source of another package needs; sources make the policies whose rollouts a dataset holds.
+"""The public module for a behavior plug-in: base class of the sources of policies that collect data.
 
-Snapshots and checkpoints have files of their own; their names stand here too.
+The names of snapshots, checkpoints and tasks are repeated here.
 """
 
 import abc
@@ -34,16 +34,14 @@ __all__ = [
 
 @dataclass(frozen=True)
 class BehaviorContext:
-    """The inputs of a source for the behavior policies of a unit.
+    """What a source receives to make the policies of a unit, the tasks that are trained together.
 
     Attributes:
-        environment: the environment of the tasks.
-        tasks: the unit's tasks.
         seed: root seed of the build.
-        observation: the policies' view.
-        reward: the reward for training.
+        observation: the view that policies receive.
+        reward: the reward that they are trained on.
         report: called with the number of environment steps since the last call.
-        checkpoints: returns the checkpoint folder for the training of the given tasks.
+        checkpoints: returns the checkpoint folder for a training of some tasks.
     """
 
     environment: Environment
@@ -56,11 +54,7 @@ class BehaviorContext:
 
 
 class BehaviorSource(abc.ABC):
-    """Makes the behavior policies of tasks; a plug-in of the entry point group `tcmrl.behavior`.
-
-    Args:
-        settings: an instance of `Settings`.
-    """
+    """Makes the behavior policies of tasks; a plug-in of the entry point group `tcmrl.behavior`."""
 
     name: ClassVar[str]
     Settings: ClassVar[type[BaseModel]]
@@ -83,7 +77,7 @@ class BehaviorSource(abc.ABC):
 
     @property
     def group_size(self) -> int:
-        """Number of task indices per unit: tasks with the same `index // group_size` are trained together."""
+        """Task indices per unit: tasks with the same `index // group_size` are trained together."""
         return 1
 
     @property
@@ -92,7 +86,7 @@ class BehaviorSource(abc.ABC):
         return 0
 
     def with_warmup(self, steps: int) -> "BehaviorSource":
-        """This source with a warm-up of at most `steps` steps, for forecasts that measure updates."""
+        """This source with at most `steps` warm-up steps, for estimates that measure the time of updates."""
         return self
 
     @abc.abstractmethod

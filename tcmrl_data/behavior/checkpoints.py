@@ -2,7 +2,7 @@
 
 A checkpoint is one safetensors file named by its sha256; its header holds counters and generator states as
 JSON. Nothing is pickled. A checkpoint that is damaged or has another key is ignored, and training starts
-from the beginning. A checkpoint that cannot be written is no reason to end a training.
+again from the beginning. If a checkpoint cannot be written, training continues.
 """
 
 import math
@@ -20,7 +20,7 @@ from tcmrl_data.foundation.errors import StorageError
 
 CHECKPOINT_SECONDS = 60.0
 CHECKPOINT_SHARE = 0.05
-"""Maximum share of the time for writing checkpoints."""
+"""Maximum share of the time that is spent on writing checkpoints."""
 
 
 @dataclass(frozen=True)
@@ -28,8 +28,8 @@ class TrainingState:
     """State of a training.
 
     Attributes:
-        values: JSON values; `steps` is the number of environment steps done, and `failed`, if it is there,
-            the first snapshot step that each failed task will never have, by task index as text.
+        values: JSON values. `steps` is the number of environment steps done. The optional `failed` maps the
+            index (as text) of each task that failed to its first snapshot step that will never exist.
         arrays: arrays by name.
     """
 
@@ -42,12 +42,12 @@ class CheckpointFolder:
 
     Args:
         dataset: folder of the dataset.
-        unit: name of the subfolder.
-        key: digest of everything that the training depends on; a checkpoint with another key is ignored.
-        missing: first missing snapshot step of every task that lacks one. A checkpoint at this step or later
-            is ignored, unless the task had failed by then.
-        seconds: minimum time between two checkpoints; 0 for one at every opportunity.
-        warn: called with one line when a checkpoint could not be written, once.
+        unit: name of the unit's subfolder.
+        key: digest of everything that the training depends on.
+        missing: by index of each incomplete task, its first missing snapshot step. A checkpoint at this step
+            or later is ignored, unless the task had failed by then.
+        seconds: minimum time between two checkpoints; 0 for as many as possible.
+        warn: called once, with one line, when a checkpoint could not be written.
     """
 
     def __init__(
@@ -72,7 +72,7 @@ class CheckpointFolder:
     def save(self, checkpoint: TrainingState) -> None:
         """Writes a checkpoint and removes the previous one.
 
-        If the disk refuses, the previous one stays, a warning is given, and the next time it is tried again.
+        If the file cannot be written, the previous one stays and a warning is given.
         """
         began = time.monotonic()
         try:
@@ -114,7 +114,7 @@ class CheckpointFolder:
         return None
 
     def _lacks_nothing(self, values: Mapping[str, Any]) -> bool:
-        """Whether a training that continues from a state yields every missing snapshot that it can."""
+        """Whether a training that continues from here makes every missing snapshot that can be made."""
         failed = values.get("failed", {})
         return all(
             values["steps"] < step or failed.get(str(task), math.inf) <= step

@@ -38,8 +38,8 @@ class SacSettings(BaseModel):
         hidden: widths of the actor's and the critics' ReLU layers.
         steps: environment steps of training.
         warmup: uniform random steps before the first update.
-        snapshots: steps at which the policy is stored, from 0 to `steps`; all others lie after the warm-up,
-            during which the policy does not change.
+        snapshots: steps at which the policy is stored: 0, then steps after the warm-up (in which the policy
+            does not change), up to `steps`.
         train_frequency: environment steps between updates.
         gradient_steps: gradient steps per update.
         entropy: the entropy coefficient, above 0, or `auto` to learn it.
@@ -133,8 +133,7 @@ class SacSource(SacTraining):
     def _train(self, context: BehaviorContext, task: Task) -> Iterator[Snapshot]:
         """Trains in chunks of steps and writes checkpoints between chunks, at the start of an episode.
 
-        Several calls of SB3's `learn` give the same result as one call, so chunks and checkpoints do not
-        change the result.
+        Several calls of SB3's `learn` give the same bits as one call.
         """
         settings, checkpoints = self.settings, context.checkpoints([task])
         episodes = KeyedResets(context, task)
@@ -186,7 +185,7 @@ def make_model(settings: SacSettings, environment: gymnasium.Env[Any, Any], *, s
 
 @final
 class KeyedResets(gymnasium.Wrapper[Any, Any, Any, Any]):
-    """Resets the n-th training episode with its own keyed seed, independent of earlier episodes.
+    """Gives every training episode its own keyed seed, so that it does not depend on earlier episodes.
 
     Attributes:
         episode: number of the current episode; -1 before the first.
@@ -214,7 +213,7 @@ class KeyedResets(gymnasium.Wrapper[Any, Any, Any, Any]):
 
 
 def capture(model: "SAC", episodes: KeyedResets) -> TrainingState:
-    """Captures the state of a model whose current episode has no step yet."""
+    """The state of a model whose current episode has no step yet."""
     import torch
 
     buffer = model.replay_buffer
@@ -241,7 +240,7 @@ def capture(model: "SAC", episodes: KeyedResets) -> TrainingState:
 
 
 def restore(model: "SAC", episodes: KeyedResets, checkpoint: TrainingState) -> int:
-    """Restores a checkpoint into a new model; returns the number of environment steps done."""
+    """Restores a checkpoint into a new model; returns its number of environment steps."""
     import torch
 
     values, arrays = checkpoint.values, checkpoint.arrays

@@ -1,4 +1,4 @@
-"""Stable-Baselines3's zip files of strangers: the actor of a SAC, without unpickling what can run code.
+"""The actor of a SAC from a Stable-Baselines3 zip file, without running code of the file.
 
 `data` is JSON. Its `:serialized:` texts are pickles and are never looked at; what is needed stands beside
 them as plain text. `policy.pth` is read by torch with `weights_only`, which knows tensors alone. Nothing is
@@ -29,7 +29,7 @@ from tcmrl_data.foundation.validation import first_problem
 LARGEST_FILE = 2**29
 FLOOR_BYTES = 2**20
 LARGEST_RATIO = 2
-"""Bytes that may be unpacked for each byte of a file, beside the floor; weights hardly compress."""
+"""Bytes that may be unpacked per byte of a file, in addition to the floor; weights hardly compress."""
 
 RELU = "<class 'torch.nn.modules.activation.ReLU'>"
 FLATTEN = "stable_baselines3.common.torch_layers.FlattenExtractor"
@@ -46,9 +46,9 @@ def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
         observation: the view that the policy was trained with.
 
     Raises:
-        SnapshotError: the file holds no SAC with ReLU layers and actions in [-1, 1], is damaged or larger
-            inside than its size justifies, or the folder exists.
-        StorageError: the operating system refuses to write a file.
+        SnapshotError: the file holds no SAC with ReLU layers and actions in [-1, 1], is damaged or unpacks to
+            too much; or the folder exists.
+        StorageError: a file cannot be written.
     """
     if out.exists():
         raise SnapshotError(f"{out} exists; choose another folder")

@@ -90,7 +90,7 @@ class Snapshot:
     def of_network(
         cls, step: int, observation: View, tensors: Mapping[str, npt.NDArray[np.float32]]
     ) -> "Snapshot":
-        """The snapshot of a Gaussian policy; its tensors say how wide it is."""
+        """A snapshot of a Gaussian policy with the sizes of its tensors."""
         biases = [name for name in tensors if name.startswith("hidden.") and name.endswith(".bias")]
         description = GaussianDescription(
             observation=observation,
@@ -101,7 +101,7 @@ class Snapshot:
         return cls(step, description, tensors)
 
     def digest(self) -> str:
-        """The sha256 of the description and of every tensor's dtype, shape and bytes."""
+        """The sha256 of the description and of the dtype, shape and bytes of every tensor."""
         tensors = {
             name: [str(array.dtype), list(array.shape), sha256(np.ascontiguousarray(array).data)]
             for name, array in self.tensors.items()
@@ -112,7 +112,7 @@ class Snapshot:
         """The policy as a controller for lanes with the given tasks.
 
         Raises:
-            SnapshotError: the policy is scripted, but the environment has no expert.
+            SnapshotError: the policy is scripted and the environment has no expert.
         """
         if isinstance(self.description, GaussianDescription):
             return GaussianController(self.description, self.tensors)
@@ -132,12 +132,7 @@ class Snapshot:
 
 
 def read_snapshot(read: ReadFile, step: int, *, place: str) -> Snapshot:
-    """Reads a snapshot.
-
-    Args:
-        read: reads a file of the snapshot.
-        step: the snapshot's.
-        place: where the files lie, for error messages.
+    """Reads a snapshot; error messages begin with `place`.
 
     Raises:
         SnapshotError: a file is missing or malformed, tensors do not have the names, shapes and dtypes of
@@ -162,10 +157,7 @@ def _read_tensors(
     file = f"{place}: policy.safetensors"
     weights = sum(int(np.prod(shape)) for shape in shapes.values())
     try:
-        data = read("policy.safetensors", limit=4 * weights + HEADER_BYTES)
-        if len(data) < 4 * weights:
-            raise SnapshotError(f"{file}: {len(data)} bytes, the policy needs {4 * weights}")
-        tensors = load(data)
+        tensors = load(read("policy.safetensors", limit=4 * weights + HEADER_BYTES))
     except (OSError, ValueError, KeyError, TypeError, StoreError, SafetensorError) as error:
         raise SnapshotError(f"{file}: cannot be read as safetensors ({one_line(error)})") from None
     found = {name: array.shape for name, array in tensors.items()}

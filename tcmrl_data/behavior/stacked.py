@@ -1,7 +1,7 @@
 """The source `stacked`: trains the SAC agents of a group of tasks in lockstep.
 
-Every agent has its own replay buffer, entropy coefficient and random streams, and the algorithm and settings
-of the source `sac`. Only rounding may depend on the group.
+Algorithm and settings are those of the source `sac`. Every agent has its own replay buffer, entropy
+coefficient and random streams, so that only rounding may depend on the group.
 """
 
 import contextlib
@@ -19,18 +19,18 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError
 
 REPORT_EVERY = 20
-"""Environment steps of the group between two reports of progress and checks for a due checkpoint."""
+"""Environment steps of the group between two reports of progress; a checkpoint is written between them."""
 
 
 class StackedSettings(SacSettings):
     """The `[behavior.stacked]` table: that of `sac`, and the grouping of tasks.
 
     Attributes:
-        group: task indices per group; part of the data's identity, since it may change rounding.
-        device: device of networks and replay buffers; another device rounds differently.
-        matmul_precision: torch's precision of float32 matrix products. `medium` multiplies in bfloat16 on
-            processors that support it, which is faster, with errors up to about 1e-2 of a product's standard
-            deviation (the error is measured and recorded with every part). It does not affect rollouts.
+        group: task indices per group; part of the data's identity, because it may change rounding.
+        device: device of networks and replay buffers; devices round differently.
+        matmul_precision: torch's precision of float32 matrix products in training. `medium` multiplies in
+            bfloat16 on processors that support it: faster, with errors up to about 1e-2 of a product's
+            standard deviation, which are measured and recorded with every part.
     """
 
     group: int = Field(ge=1)
@@ -102,7 +102,7 @@ class StackedSource(SacTraining):
 
 @contextlib.contextmanager
 def _matmul_precision(precision: str) -> Iterator[None]:
-    """Sets torch's precision of matrix products, and restores the previous one at the end."""
+    """Sets torch's precision of matrix products for the duration of a block."""
     import torch
 
     before = torch.get_float32_matmul_precision()
@@ -114,7 +114,7 @@ def _matmul_precision(precision: str) -> Iterator[None]:
 
 
 def _matmul_error(rows: int, width: int, device: str) -> float:
-    """Largest error of a matrix product of standard normal numbers, in the product's standard deviations."""
+    """Largest error of a product of standard normal matrices, in standard deviations of the product."""
     import torch
 
     generator = torch.Generator().manual_seed(0)

@@ -26,19 +26,15 @@ SQUASH_EPSILON = 1e-6
 CRITICS = 2
 
 PADDING = 64
-"""Vectors are padded to a multiple of this. The remainder of a vectorized loop may round differently, so
-without padding an agent's results would depend on its position in the group."""
+"""Sizes of vectors are rounded up to a multiple of this. The remainder of a vectorized loop may round
+differently, so without padding an agent's results would depend on its position in the group."""
 
 
 @dataclass(frozen=True)
 class ReplayBatch:
-    """One batch of B transitions per task.
+    """One batch of B transitions for each of N tasks: arrays (N, B, …).
 
     Attributes:
-        observations: (N, B, observation_dim).
-        actions: (N, B, action_dim).
-        next_observations: (N, B, observation_dim).
-        rewards: (N, B).
         terminated: (N, B), 1 if the task ended the episode, else 0; a time limit is 0.
     """
 
@@ -105,14 +101,7 @@ def head_gradient(sample: PolicySample, entropy: Tensor, action_gradient: Tensor
 
 @dataclass(frozen=True)
 class StackedLayer:
-    """Views into a network's flat vectors.
-
-    Attributes:
-        weight: (S, outputs, inputs), as in torch's Linear.
-        bias: (S, 1, outputs).
-        weight_gradient: (S, outputs, inputs).
-        bias_gradient: (S, 1, outputs).
-    """
+    """Views into a network's flat vectors: weights (S, outputs, inputs) and biases (S, 1, outputs)."""
 
     weight: Tensor
     bias: Tensor
@@ -149,7 +138,7 @@ class StackedNetwork:
         return [torch.zeros(shape, device=self.parameters.device) for shape in shapes]
 
     def forward(self, inputs: Tensor, outputs: Sequence[Tensor]) -> Tensor:
-        """Computes all layers' outputs for inputs (S, rows, widths[0]); returns the last layer's."""
+        """Fills all layers' outputs for inputs (S, rows, widths[0]); returns the last layer's."""
         for layer, output in zip(self.layers, outputs, strict=True):
             torch.baddbmm(layer.bias, inputs, layer.weight.transpose(1, 2), out=output)
             if output is not outputs[-1]:
@@ -158,12 +147,10 @@ class StackedNetwork:
         return inputs
 
     def propagate(self, outputs: Sequence[Tensor], deltas: Sequence[Tensor]) -> None:
-        """Propagates the loss's gradient from the last layer to the first.
+        """Propagates the loss's gradient from the last layer to the first, after `forward`.
 
-        Args:
-            outputs: the outputs of `forward`.
-            deltas: the last one holds dL / d outputs[-1]; the others receive the gradients with respect to
-                the layers' outputs before the ReLU.
+        The last of `deltas` holds dL / d outputs[-1]; the others receive the gradients with respect to the
+        layers' outputs before the ReLU.
         """
         for index in range(len(self.layers) - 1, 0, -1):
             delta = deltas[index - 1]
@@ -234,7 +221,7 @@ class StackedSac:
         self._make_buffers(settings.batch_size)
 
     def _adam(self, vectors: Sequence[tuple[Tensor, Tensor]]) -> Adam:
-        """Adam for (vector, gradient) pairs, with its moments already created."""
+        """Adam for (vector, gradient) pairs, with its moments created."""
         for vector, gradient in vectors:
             vector.grad = gradient
         optimizer = Adam([vector for vector, _ in vectors], lr=self.settings.learning_rate, fused=True)

@@ -4,13 +4,13 @@ Both use Gymnasium's Ant-v5 without contact forces in the observation. An action
 velocity over it is measured as the published code does.
 
 Ant-Dir. The reward is v · d, the velocity along the task's direction, as in the published code of CORRO and
-UNICORN. PEARL and FOCAL reward v · d - 0.5 |a|^2 - contact cost + 1, which is `reward = "full"`: standing
-still then earns about 200 in every task, so that a policy that was trained for a short time need not know its
-task. Observations are the 27 values of position without x and y, and velocity.
+UNICORN. PEARL and FOCAL reward v · d - 0.5 |a|^2 - contact cost + 1, which is `reward = "full"`. An ant that
+stands still then earns about 200 in every task, so that a briefly trained policy need not know its task.
+Observations are positions without x and y, and velocities, 27 values.
 
-Ant-Goal. The reward is -|p - goal|_1 - 0.1 |a|^2, where p is the place of the next observation, in m. PEARL
-and CSRO also subtract a contact cost; in CSRO's code it is zero, since MuJoCo 2.0 through mujoco-py computes
-no contact forces, and here it is off by default. Observations are 29 values with x and y, as in CSRO.
+Ant-Goal. The reward is -|p - goal|_1 - 0.1 |a|^2, where p is the position after the step, in m. PEARL and
+CSRO also subtract a contact cost. In CSRO's code it is zero, because MuJoCo 2.0 with mujoco-py computes no
+contact forces; here its default is zero. Observations are 29 values with x and y, as in CSRO.
 """
 
 import math
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 ACTION_DIM = 8
 ALIVE_BONUS, DIRECTION_CONTROL_COST, CONTACT_COST = 1.0, 0.5, 5e-4
-"""Terms of the full reward; the contact cost weighs the sum of the squared contact forces, clipped to 1."""
+"""Terms of the full reward; the last is the weight of the squared contact forces, which are clipped to 1."""
 
 
 class AntDirSettings(EnvironmentSettings):

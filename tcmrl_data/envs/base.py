@@ -1,7 +1,6 @@
-"""What an environment of another package needs: base classes of environments, settings, lanes and cameras.
+"""The public module for an environment plug-in: base classes of environments, settings, lanes and cameras.
 
-Lanes step several episodes together. Controllers and trajectories have files of their own; their names stand
-here too.
+Lanes step several episodes together. The names of controllers and trajectories are repeated here.
 """
 
 import abc
@@ -53,10 +52,10 @@ Parameters = Mapping[str, Any]
 """JSON values that define one task."""
 
 Reward = Literal["stored", "dense"]
-"""`stored`: the reward in the dataset. `dense`: the shaped reward, if the stored reward is sparse."""
+"""`stored`: the reward in the dataset. `dense`: the shaped reward where the stored reward is sparse."""
 
 DENSE_REWARDS = "dense_rewards"
-"""The extra array that holds shaped rewards beside sparse ones, float32."""
+"""Name of the extra array with dense (shaped) rewards, float32, in datasets with sparse rewards."""
 
 TaskSplit = Literal["permutation", "strata", "interpolation"]
 """How test tasks are chosen; `EnvironmentSettings` explains it."""
@@ -78,10 +77,10 @@ class EnvironmentSettings(BaseModel):
         train: number of training tasks.
         horizon: steps after which an episode is truncated.
         reward_density: `sparse` if few steps have a reward (paper, Appendix F.3).
-        split: how test tasks are chosen. `permutation`: any of all tasks are drawn. `strata`: the tasks, in
-            the order of `Environment.ordering`, are cut into as many strata as there are test tasks, and one
-            task is drawn of each, so that training and test tasks spread alike. `interpolation`: as `strata`,
-            but the middle task of each, of an even number the later one; nothing is drawn.
+        split: how test tasks are chosen. `permutation`: drawn from all tasks. `strata`: the tasks, sorted by
+            `Environment.ordering`, are divided into as many strata as there are test tasks, and one task is
+            drawn from each stratum, so that test tasks cover the same range as training tasks.
+            `interpolation`: the middle task of each stratum (the later one of two); nothing is drawn.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
@@ -147,18 +146,14 @@ class Camera(abc.ABC):
 
     @abc.abstractmethod
     def picture(self, observations: FloatArray) -> Picture:
-        """The task as it is now.
-
-        Args:
-            observations: (t + 1, observation_dim), full view, of the episode up to now.
-        """
+        """The task as it is now; observations (t + 1, observation_dim) are the episode so far, full view."""
 
     def close(self) -> None:
-        """Frees what the camera holds; does nothing by default."""
+        """Frees the camera's resources; does nothing by default."""
 
 
 class FigureCamera(Camera):
-    """Base class of cameras that draw what they see of the observations with matplotlib; sizes in pixels."""
+    """Base class of cameras that draw observations with matplotlib; width and height are in pixels."""
 
     def __init__(self, width: int, height: int) -> None:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -170,12 +165,7 @@ class FigureCamera(Camera):
 
     @abc.abstractmethod
     def draw(self, axes: "Axes", observations: FloatArray) -> None:
-        """Draws the task on empty axes that fill the picture and have no frame.
-
-        Args:
-            axes: where to draw; the method sets their limits.
-            observations: as for `picture`.
-        """
+        """Draws the task on empty axes without a frame, and sets their limits; arguments as for `picture`."""
 
     def picture(self, observations: FloatArray) -> Picture:
         self._axes.clear()
@@ -190,7 +180,7 @@ class Environment(abc.ABC):
     """A family of tasks with the same state and action space.
 
     A subclass is final, sets the class attributes and is a plug-in of the entry point group
-    `tcmrl.environments`. It imports simulators (mujoco, metaworld) only when it makes a task.
+    `tcmrl.environments`. Its module does not import a simulator (mujoco, metaworld) at the top; `make` does.
     """
 
     name: str
@@ -201,13 +191,13 @@ class Environment(abc.ABC):
     extras: ClassVar[Mapping[str, type[np.generic]]] = {}
     """Dtypes of further per-step arrays, by name."""
     ordering_name: ClassVar[str | None] = None
-    """What `ordering` measures, with its unit; None where tasks have no order."""
+    """What `ordering` measures, with its unit; None if tasks have no order."""
     is_circular: ClassVar[bool] = False
-    """Whether `ordering` is a place on a circle, where the last task is beside the first."""
+    """Whether `ordering` is a position on a circle, so that the last task is next to the first."""
     plane: ClassVar[tuple[str, str] | None] = None
-    """Names of the first two columns of observations where they are a place in the plane; None elsewhere."""
+    """Labels of the first two observation columns if they are a position in the plane, else None."""
     simulator_bytes: ClassVar[int] = 0
-    """Measured memory of one simulated task; 0 for tasks without a simulator."""
+    """Measured memory of one task's simulator in bytes; 0 without a simulator."""
 
     def __init__(self, settings: EnvironmentSettings) -> None:
         if settings.split != "permutation" and self.ordering_name is None:
@@ -220,32 +210,31 @@ class Environment(abc.ABC):
 
     @classmethod
     def members(cls) -> list[str]:
-        """The environments of this class: the plug-in's name, or several names `<plug-in>/<member>`."""
+        """Names of the class's environments: the plug-in's name, or several names `<plug-in>/<member>`."""
         return [cls.name]
 
     @classmethod
     def provides(cls, name: str) -> bool:
-        """Whether the name of a dataset's environment is one of this class."""
+        """Whether datasets of the environment `name` belong to this class."""
         return name in cls.members()
 
     @classmethod
     def recipe_file(cls, name: str) -> Traversable:
-        """The TOML recipe of the environment `name`; plug-ins of other packages override this method."""
+        """The TOML recipe of the environment `name`; a plug-in of another package overrides this method."""
         return importlib.resources.files("tcmrl_manifests") / f"{name.partition('/')[0]}.toml"
 
     @abc.abstractmethod
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         """Draws the parameters of all tasks as the published code does; JSON values.
 
-        `draw_tasks` rounds floats to ten significant digits. Python's `math` is better than NumPy's functions
-        of arrays, whose last digits depend on the processor's instruction set.
+        `draw_tasks` rounds floats to ten significant digits. Prefer Python's `math` to NumPy's array
+        functions, whose last digits depend on the processor's instruction set.
         """
 
     def ordering(self, parameters: Parameters) -> float | None:
-        """The one number that orders the tasks, such as a goal's angle or a velocity.
+        """The number by which tasks are sorted, such as a goal's angle or a velocity; None if there is none.
 
-        None where several parameters define a task, or none of them has an order. A class that overrides this
-        method also sets `ordering_name`.
+        A class that overrides this method also sets `ordering_name`.
         """
         return None
 
@@ -255,10 +244,7 @@ class Environment(abc.ABC):
     ) -> gymnasium.Env[Any, Any]:
         """Makes one task as a Gymnasium environment with actions in [-1, 1], truncated at the horizon.
 
-        Args:
-            parameters: the task's parameters.
-            view: which observations the environment returns.
-            reward: `dense` for the shaped reward; equals `stored` if the stored reward is dense.
+        `view` chooses the observations. Both values of `reward` are the same if the stored reward is dense.
         """
 
     def lanes(self, parameters: Sequence[Parameters], *, reward: Reward = "stored") -> Lanes:
@@ -270,63 +256,55 @@ class Environment(abc.ABC):
         return observations
 
     def oracle(self, parameters: Sequence[Parameters]) -> Controller | None:
-        """A controller that knows the lanes' tasks; None if there is none."""
+        """A (nearly) optimal controller that knows the lanes' tasks; None if there is none."""
         return None
 
     def scripted(self, parameters: Sequence[Parameters], noise: float) -> Controller | None:
-        """The environment's expert for every lane, with N(0, noise) added to actions; None if there is none.
-
-        Args:
-            parameters: the lanes' tasks.
-            noise: standard deviation of the noise.
-        """
+        """The environment's expert per lane, with N(0, noise) added to actions; None if there is none."""
         return None
 
     def camera(
         self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
     ) -> Camera | None:
-        """A camera that takes pictures of a task; None if the environment has no picture.
+        """A camera for a task; None if the environment cannot be drawn.
 
         Args:
-            task: what `make` made, with the full view; it plays an episode while pictures are taken.
-            parameters: the task's.
-            width: of the pictures in pixels.
-            height: of the pictures in pixels.
+            task: made by `make` with the full view; it plays an episode while pictures are taken.
+            parameters: the task's parameters.
+            width: width of a picture in pixels.
+            height: height of a picture in pixels.
 
         Raises:
-            RenderingError: this machine cannot draw it.
+            RenderingError: this machine cannot draw the task.
         """
         return None
 
     def draw_path(
         self, axes: "Axes", parameters: Parameters, observations: FloatArray, *, color: str
     ) -> None:
-        """Draws a task and the path of an episode in it, where observations are places in a plane.
+        """Draws a task and the path of one of its episodes, if observations are positions in a plane.
 
         Args:
-            axes: matplotlib's, where other tasks may be drawn too.
-            parameters: the task's.
+            axes: matplotlib's axes, which may show other tasks too.
+            parameters: the task's parameters.
             observations: (T + 1, observation_dim), stored view.
-            color: of the task, as matplotlib names it.
+            color: the task's color for matplotlib.
 
         Raises:
-            RenderingError: the environment has no such plane, which is the default.
+            RenderingError: observations are not positions in a plane (the default).
         """
-        raise RenderingError(f"paths of {self.name} cannot be drawn, since its observations are no places")
+        raise RenderingError(
+            f"paths of {self.name} cannot be drawn, because its observations are not positions in a plane"
+        )
 
     def fingerprint(self) -> dict[str, Any]:
-        """Library versions, time step, model hash and anything else that the dynamics depend on; JSON."""
+        """JSON values of everything that the dynamics depend on: library versions, time step, model hash."""
         return {}
 
 
 @final
 class EnvironmentLanes(Lanes):
-    """Lanes that step Gymnasium environments one after another.
-
-    Args:
-        environment: the family of the tasks.
-        tasks: one per lane, made with the full view.
-    """
+    """Lanes that step Gymnasium environments, made with the full view, one after another."""
 
     def __init__(self, environment: Environment, tasks: Sequence[gymnasium.Env[Any, Any]]) -> None:
         self.num_lanes = len(tasks)
@@ -388,8 +366,8 @@ def make_environment(settings: Mapping[str, Any]) -> Environment:
 
     Raises:
         UnknownNameError: there is no such environment.
-        RecipeError: a split along an order that the tasks lack.
-        ValidationError: pydantic's, if the table is not valid.
+        RecipeError: the split needs an order, and the tasks have none.
+        ValidationError: pydantic's; the table is not valid.
     """
     kind = ENVIRONMENTS.get(settings["name"])
     return kind(kind.Settings.model_validate_json(json.dumps(settings)))

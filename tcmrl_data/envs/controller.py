@@ -10,7 +10,7 @@ import numpy as np
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 
 View = Literal["stored", "full"]
-"""`stored`: observations in the dataset, for the meta-learner. `full`: includes values hidden by the task."""
+"""`stored`: the observations in the dataset. `full`: with the values that datasets hide, such as the goal."""
 
 
 @dataclass(frozen=True)
@@ -76,11 +76,7 @@ class UniformController(Controller):
 
 @final
 class PlaybackController(Controller):
-    """Plays stored actions, whatever it observes, for one rollout.
-
-    Args:
-        actions: (steps, action_dim) of every lane; zeros follow where a lane's actions end.
-    """
+    """Plays stored actions for one rollout: (steps, action_dim) per lane, then zeros."""
 
     def __init__(self, actions: Iterable[FloatArray]) -> None:
         self._actions, self._step = list(actions), 0
@@ -110,12 +106,12 @@ class _Wrapper(Controller):
 
 @final
 class NoisyController(_Wrapper):
-    """Another controller's actions with normal noise added, for one rollout.
+    """Adds normal noise to another controller's actions, for one rollout, which clips the sum to [-1, 1].
 
     Args:
-        controller: whose actions these are.
-        sigma: standard deviation of the noise; rollouts clip the sum to [-1, 1].
-        generators: of the noise, one per lane, so that the controller's own noise stays what it is.
+        controller: the controller; its own noise does not change.
+        sigma: standard deviation of the added noise.
+        generators: generators of the added noise, one per lane.
     """
 
     def __init__(
@@ -136,12 +132,12 @@ class NoisyController(_Wrapper):
 
 @final
 class BelievingController(_Wrapper):
-    """Another controller that keeps seeing the hidden entries of its own task, whatever the task is.
+    """Replaces what a controller observes of the task by the values of another task.
 
     Args:
-        controller: whose actions these are.
-        hidden: (observation_dim,) bool, entries of full observations to replace.
-        values: (observation_dim,), what to replace them by.
+        controller: the controller.
+        hidden: (observation_dim,) bool, the entries of full observations to replace.
+        values: (observation_dim,), their new values.
     """
 
     def __init__(self, controller: Controller, hidden: BoolArray, values: FloatArray) -> None:
@@ -156,7 +152,7 @@ class BelievingController(_Wrapper):
 
 @final
 class DeterministicController(_Wrapper):
-    """Another controller without its noise, which for a Gaussian policy is its most likely action."""
+    """Sets another controller's noise to zero; a Gaussian policy then takes its most likely action."""
 
     def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
         return np.zeros((num_steps, action_dim), dtype=np.float32)

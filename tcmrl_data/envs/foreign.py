@@ -1,4 +1,4 @@
-"""The environment of imported data that none of ours made: sizes, and nothing that could be simulated."""
+"""The environment of imported data whose environment is not installed: only sizes are known."""
 
 from typing import Any, Literal, NoReturn, final
 
@@ -10,11 +10,11 @@ from tcmrl_data.foundation.errors import SimulationError
 
 
 class ForeignSettings(EnvironmentSettings):
-    """What the data themselves tell of their environment.
+    """What the data themselves say about their environment.
 
     Attributes:
-        tasks: number of tasks that were imported; one is enough.
-        train: number of training tasks among them; all may be.
+        tasks: number of imported tasks, at least one.
+        train: number of training tasks among them, possibly all.
         horizon: steps of the longest episode.
         observation_dim: width of observations.
         action_dim: width of actions.
@@ -36,10 +36,9 @@ class ForeignSettings(EnvironmentSettings):
 
 @final
 class Foreign(Environment):
-    """An environment of which only the data are known.
+    """Sizes and horizon of imported data, where readers of a dataset always find them.
 
-    It is an environment, and its datasets have a recipe, so that every reader of a dataset finds sizes and
-    horizon where it always does. No recipe file can name it, and whatever needs a simulation is refused.
+    A recipe file cannot name it, and everything that needs a simulation is refused.
     """
 
     name = "foreign"
@@ -49,12 +48,12 @@ class Foreign(Environment):
     def __init__(self, settings: ForeignSettings) -> None:
         super().__init__(settings)
         self.observation_dim, self.action_dim = settings.observation_dim, settings.action_dim
-        # of the class elsewhere, since one class has one simulator; here every dataset has its own
+        # a class attribute elsewhere; here datasets differ
         self.extras = {name: np.dtype(dtype).type for name, dtype in settings.extra_arrays.items()}  # type: ignore[misc]
 
     @classmethod
     def members(cls) -> list[str]:
-        """None that a build could name."""
+        """None, because it cannot be built."""
         return []
 
     @classmethod

@@ -59,7 +59,7 @@ class HalfCheetahDirSettings(EnvironmentSettings):
 
 
 class _HalfCheetah(SimulatedEnvironment):
-    """Base class of both: a task earns something for its velocity, and pays for its actions."""
+    """Base class of both: the reward is a function of the velocity minus the control cost."""
 
     observation_dim = 17
     action_dim = 6
@@ -78,7 +78,7 @@ class _HalfCheetah(SimulatedEnvironment):
 
     @abc.abstractmethod
     def velocity_reward(self, velocity: float, parameters: Parameters) -> float:
-        """What a task earns in a step at a forward velocity in m/s."""
+        """The reward of a step with a forward velocity in m/s, without the control cost."""
 
 
 @final
@@ -90,8 +90,8 @@ class HalfCheetahTask(SimulatedTask):
         self._environment, self._parameters = environment, parameters
 
     def reward(self, action: FloatArray, simulator_reward: float, info: dict[str, Any]) -> float:
-        earned = self._environment.velocity_reward(float(info["x_velocity"]), self._parameters)
-        return earned - self._environment.settings.control_cost * squared_norm(action)
+        reward = self._environment.velocity_reward(float(info["x_velocity"]), self._parameters)
+        return reward - self._environment.settings.control_cost * squared_norm(action)
 
 
 @final

@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 STEP_SIZE = 0.1
 
 CENTER, WIDTH = (0.0, 0.4), 2.7
-"""What a picture shows at least: the half circle of goals with some room."""
+"""The smallest part of the plane that a picture shows: the half circle of goals and a margin."""
 
 WIND_AT, WIND_SCALE = (-0.9, 1.0), 6.0
-"""Where the wind's arrow starts, and how many times it is longer than the wind."""
+"""Start of the wind's arrow, and its length divided by the wind's."""
 
 
 class PointRobotSettings(EnvironmentSettings):
@@ -60,7 +60,7 @@ class SparsePointRobotSettings(PointRobotSettings):
 
     Attributes:
         dense_rewards: parts also store -dist of every step, as the array `dense_rewards`. The published code
-            of IDAQ and TCMRL trains the actor-critic on them; sparse ones go to the context alone.
+            of IDAQ and TCMRL trains the actor-critic on them, and only the context on sparse rewards.
     """
 
     dense_rewards: bool = False
@@ -144,7 +144,7 @@ class SparsePointRobot(_HalfCircleRobot):
     def __init__(self, settings: EnvironmentSettings) -> None:
         super().__init__(settings)
         if self.settings.dense_rewards:
-            # of the class elsewhere; here the recipe says whether they are stored
+            # a class attribute elsewhere; here the recipe decides
             self.extras = {DENSE_REWARDS: np.float32}  # type: ignore[misc]
 
     def rewards(self, distances: FloatArray, reward: Reward) -> FloatArray:
@@ -181,7 +181,7 @@ def goals_and_winds(parameters: Sequence[Parameters]) -> tuple[FloatArray, Float
 
 @final
 class GreedyController(Controller):
-    """Moves towards the goal as far as one step allows on every axis, and compensates the wind; no noise."""
+    """Moves towards the goal as far as one step allows on every axis, against the wind; without noise."""
 
     def __init__(self, goals: FloatArray, winds: FloatArray) -> None:
         self._targets = goals - winds

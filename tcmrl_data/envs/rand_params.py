@@ -5,8 +5,8 @@ coefficients by base^U(-3, 3). The models are Gymnasium's Hopper-v5 and Walker2d
 have friction 1.9). Two settings concern differences from the older models of the published code:
 
 - Physics step. An action lasts 4 steps of 0.004 s in the older models and 4 steps of 0.002 s in Gymnasium's.
-  The default is 0.004 s: the horizon and the published returns belong to it, and with random actions all
-  tasks stayed finite.
+  The default is 0.004 s, for which horizon and returns were published; with random actions all tasks stayed
+  finite.
 - Derived constants. MuJoCo stores quantities computed from masses (inverse weights, which set the stiffness
   of contacts and joint limits). By default `mj_setConst` recomputes them for the scaled body; the published
   code keeps the values of the nominal body.

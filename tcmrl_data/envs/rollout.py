@@ -19,7 +19,7 @@ STEP_ARRAYS: Mapping[str, type[np.generic]] = {
     "truncated": np.bool_,
     "active": np.bool_,
 }
-"""Recorded arrays of a transition and their dtypes."""
+"""Arrays of a transition that are recorded, and their dtypes."""
 
 
 def roll_out(
@@ -37,11 +37,11 @@ def roll_out(
     they are executed and stored. The returned observations are the environment's stored view.
 
     Args:
-        environment: defines the horizon, the action size and the stored view.
-        lanes: L lanes; may be used for several rollouts.
-        controller: acts for all L lanes and observes every step.
-        reset_seeds: L seeds, one per episode.
-        noise: L generators, one per episode; the noise of an episode is drawn at once.
+        environment: gives the horizon, the action size and the stored view.
+        lanes: L lanes, which may be used for several rollouts.
+        controller: acts for all lanes and observes every step.
+        reset_seeds: one per lane.
+        noise: one generator per lane; the noise of a whole episode is drawn before it starts.
 
     Returns:
         L trajectories in lane order; float32 observations, actions and rewards.
@@ -75,14 +75,14 @@ def roll_out(
 
 
 def hidden_entries(environment: Environment) -> BoolArray:
-    """(observation_dim,), entries of full observations that the stored view hides."""
+    """The entries of full observations that the stored view hides, (observation_dim,) bool."""
     shown = np.ones(environment.observation_dim)
     found: BoolArray = environment.stored_view(shown) != shown
     return found
 
 
 def first_observation(environment: Environment, task: Task) -> FloatArray:
-    """(observation_dim,), the full observation after a reset; hidden entries tell the task."""
+    """The task's full observation after a reset, (observation_dim,); its hidden entries describe the task."""
     lanes = environment.lanes([task.parameters])
     try:
         found: FloatArray = lanes.reset([0])[0]
@@ -113,12 +113,7 @@ class Recorder:
     def record(
         self, transition: Transition, extras: Mapping[str, npt.NDArray[np.generic]] | None = None
     ) -> None:
-        """Adds a copy of one step of all lanes.
-
-        Args:
-            transition: the step.
-            extras: further arrays of shape (lanes,), with the same names in every step.
-        """
+        """Adds a copy of one step; `extras` are arrays (lanes,) with the same names in every step."""
         if not self._observations:
             self._observations.append(transition.observations.astype(np.float32))
         self._observations.append(transition.next_observations.astype(np.float32))

@@ -1,4 +1,4 @@
-"""Environments simulated by MuJoCo: base classes, the fingerprint of their physics, and their camera."""
+"""Base classes of environments and tasks simulated by MuJoCo: their loop, fingerprint and camera."""
 
 import abc
 import functools
@@ -19,7 +19,7 @@ from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import RenderingError
 
 OPEN_GL = ("egl", "osmesa")
-"""What MuJoCo can draw with where there is no screen: the graphics driver, or Mesa on the processor."""
+"""Kinds of OpenGL that need no screen: by the graphics driver, or by Mesa on the processor."""
 
 TRIAL_SECONDS = 60.0
 TRIAL = """
@@ -40,9 +40,9 @@ class Viewpoint:
 
     Attributes:
         look_at: point in the middle of the picture, in m.
-        distance: from that point, in m.
-        azimuth: direction of the look around the vertical axis, in degrees; 90 looks along y.
-        elevation: of the look, in degrees; negative looks down.
+        distance: distance from that point in m.
+        azimuth: viewing direction around the vertical axis in degrees; 90 looks along y.
+        elevation: viewing direction in degrees above the horizon; negative looks down.
     """
 
     look_at: tuple[float, float, float]
@@ -56,7 +56,7 @@ class SimulatedEnvironment(Environment):
 
     simulator_bytes = 2 * 2**20
     viewpoint: ClassVar[str | Viewpoint] = "track"
-    """Name of one of the model's cameras, or a place."""
+    """Where the camera stands: name of one of the model's cameras, or a place."""
     packages: ClassVar[tuple[str, ...]] = ()
     """Distributions that define the dynamics, in addition to mujoco and gymnasium."""
     physics: ClassVar[dict[str, Any]] = {}
@@ -93,14 +93,10 @@ class SimulatedEnvironment(Environment):
 
 
 class SimulatedTask(gymnasium.Env[FloatArray, FloatArray]):
-    """One task, run by a simulator of another library.
+    """One task, run by a simulator to which the task has been applied.
 
     Actions are clipped to [-1, 1] and episodes are truncated at the horizon. An episode depends only on the
     seed of its reset and its actions, not on earlier episodes.
-
-    Args:
-        environment: the task's family, which gives horizon and sizes.
-        simulator: with the task applied.
     """
 
     def __init__(self, environment: Environment, simulator: gymnasium.Env[Any, Any]) -> None:
@@ -131,12 +127,7 @@ class SimulatedTask(gymnasium.Env[FloatArray, FloatArray]):
         self._simulator.close()
 
     def camera(self, viewpoint: str | Viewpoint, *, width: int, height: int) -> Camera:
-        """A camera in the simulated world.
-
-        Args:
-            viewpoint: name of one of the model's cameras, or a place.
-            width: of the pictures in pixels.
-            height: of the pictures in pixels.
+        """A camera at one of the model's cameras or at a given place; width and height are in pixels.
 
         Raises:
             RenderingError: no OpenGL works on this machine.
@@ -166,7 +157,7 @@ def squared_norm(action: FloatArray) -> float:
 
 @final
 class _SimulationCamera(Camera):
-    """MuJoCo's renderer, on the first kind of OpenGL that works without a screen."""
+    """MuJoCo's renderer with the first kind of OpenGL that works without a screen."""
 
     def __init__(self, model: Any, data: Any, *, width: int, height: int, viewpoint: str | Viewpoint) -> None:
         import mujoco
@@ -176,7 +167,7 @@ class _SimulationCamera(Camera):
             raise RenderingError(
                 f"no OpenGL works here without a screen (EGL, OSMesa), so that MuJoCo cannot draw; {REMEDY}"
             )
-        # MuJoCo chooses at its import, by MUJOCO_GL; it was imported before anyone asked for a picture
+        # MuJoCo chooses at its import, by MUJOCO_GL, and has been imported to make the task
         gl: Any = import_module("mujoco.gl_context")
         gl.GLContext = import_module(f"mujoco.{kind}").GLContext
         model.vis.global_.offwidth, model.vis.global_.offheight = width, height
@@ -198,11 +189,7 @@ class _SimulationCamera(Camera):
 
 
 def check_chosen_open_gl() -> None:
-    """Refuses a kind that `MUJOCO_GL` names and that does not work, before MuJoCo fails at its import.
-
-    Raises:
-        RenderingError: the kind does not work on this machine.
-    """
+    """Raises `RenderingError` if the kind in `MUJOCO_GL` does not work here; MuJoCo fails at its import."""
     named = os.environ.get("MUJOCO_GL", "")
     if named.lower() in OPEN_GL and find_open_gl() is None:
         raise RenderingError(f"MUJOCO_GL={named} does not work here, so that MuJoCo cannot draw; {REMEDY}")
@@ -210,10 +197,10 @@ def check_chosen_open_gl() -> None:
 
 @functools.cache
 def find_open_gl() -> str | None:
-    """The first kind of OpenGL that works here, None if none does; `MUJOCO_GL` may name the only one to try.
+    """The first kind of OpenGL that works here, or None; only the one in `MUJOCO_GL`, if it names one.
 
-    Every kind is tried in a process of its own, since a process is bound to the first one that it loads, and
-    a broken driver may end it. Other values of `MUJOCO_GL`, such as `disabled`, do not matter.
+    Each kind is tried in a new process: a process cannot change the kind that it has loaded, and a broken
+    driver may end it. Other values of `MUJOCO_GL`, such as `disabled`, are ignored.
     """
     named = os.environ.get("MUJOCO_GL", "").lower()
     return next((kind for kind in ((named,) if named in OPEN_GL else OPEN_GL) if _works(kind)), None)

@@ -15,9 +15,8 @@ Split = Literal["train", "test"]
 PARAMETER_DIGITS = 10
 """Significant decimal digits of a task parameter.
 
-Vectorized functions (`exp`, `pow`, `sin`) and fused products differ between instruction sets in the last of a
-double's 16 to 17 digits; with ten digits all of them give the same number, which still has more digits than
-the float32 values of a dataset.
+Vectorized functions (`exp`, `pow`, `sin`) and fused multiply-adds differ between instruction sets in the last
+of a double's 16 to 17 digits. Ten digits are the same on all of them, and more than a dataset's float32 has.
 """
 
 
@@ -39,8 +38,8 @@ class Task:
 def draw_tasks(environment: Environment) -> tuple[Task, ...]:
     """Draws all tasks of an environment; depends on its settings only (`task_seed`, not `--seed`).
 
-    Floating point parameters are rounded to PARAMETER_DIGITS significant digits, whatever the environment
-    draws, so that they are the same bits on every instruction set.
+    Floating-point parameters are rounded to PARAMETER_DIGITS significant digits, so that they are the same
+    bits on every processor.
     """
     settings = environment.settings
     drawn = environment.draw_parameters(settings.tasks, settings.task_seed)
@@ -58,14 +57,14 @@ def draw_tasks(environment: Environment) -> tuple[Task, ...]:
 
 
 def in_order(environment: Environment, tasks: Iterable[Task]) -> list[Task]:
-    """The tasks along the environment's ordering, or by index where it has none."""
+    """The tasks sorted by the environment's ordering, or by index if it has none."""
     return sorted(tasks, key=lambda task: (place_in_order(environment, task) or 0.0, task.index))
 
 
 def place_in_order(environment: Environment, task: Task) -> float | None:
-    """The task's place in the environment's ordering, if it has one and the task the parameters for it.
+    """The value of the environment's ordering for a task; None if there is none.
 
-    Tasks of imported data may lack parameters, or have others than the environment draws.
+    Tasks of imported data may have no parameters, or other ones than the environment draws.
     """
     try:
         return environment.ordering(task.parameters)
@@ -74,22 +73,22 @@ def place_in_order(environment: Environment, task: Task) -> float | None:
 
 
 def draw_from_strata(order: Sequence[int], number: int, generator: np.random.Generator) -> set[int]:
-    """Draws one item of each of `number` strata, which are consecutive and differ in size by at most one."""
+    """Draws one item from each of `number` consecutive strata, whose sizes differ by at most one."""
     return {order[int(generator.integers(start, stop))] for start, stop in _strata(len(order), number)}
 
 
 def middles_of_strata(order: Sequence[int], number: int) -> set[int]:
-    """The middle item of each of the strata that `draw_from_strata` draws from."""
+    """The middle item of each stratum of `draw_from_strata`."""
     return {order[(start + stop) // 2] for start, stop in _strata(len(order), number)}
 
 
 def _strata(size: int, number: int) -> Iterator[tuple[int, int]]:
-    """First and last position plus one of `number` strata."""
+    """Start and stop position of each of `number` strata."""
     return pairwise(stratum * size // number for stratum in range(number + 1))
 
 
 def _rounded(value: Any) -> Any:
-    """JSON values with their floats rounded; integers, texts and truth values stay as they are."""
+    """A JSON value with all floats rounded."""
     if isinstance(value, float):
         return float(f"{value:.{PARAMETER_DIGITS}g}")
     if isinstance(value, dict):
