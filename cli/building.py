@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from tcmrl_data.foundation.sizes import size
+from tcmrl_data.foundation.machine import size
 from tcmrl_data.recipe.profile import PROFILES, Profile
 
 from .frame import (

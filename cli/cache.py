@@ -5,7 +5,7 @@ import datetime
 
 import click
 
-from tcmrl_data.foundation.sizes import size
+from tcmrl_data.foundation.machine import size
 
 from .frame import fail_incomplete, make_table, output_options, print_json, print_table, remark
 

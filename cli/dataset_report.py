@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
+from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.sizes import size
 
 from .frame import output_options, print_json, remark, stopped_by_signals
 from .places import DATASET_PATH

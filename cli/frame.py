@@ -16,8 +16,7 @@ import click
 
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.threads import sleep_soon
-from tcmrl_data.foundation.torch_compiler import leave_out_compiler
+from tcmrl_data.foundation.startup import leave_out_compiler, sleep_soon
 
 if TYPE_CHECKING:
     from rich.table import Table

@@ -15,6 +15,7 @@ from typing import Any, final
 import click
 from click.shell_completion import CompletionItem
 
+from tcmrl_data.foundation.canonical import leaves
 from tcmrl_data.foundation.plugins import declared_names
 
 MANIFEST_FILE, RUN_FILE = "manifest.json", "run.json"
@@ -111,12 +112,8 @@ def _starting(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
     return [CompletionItem(name) for name in sorted(set(names)) if name.startswith(incomplete)]
 
 
-def _keys(tables: Mapping[str, Any], place: str = "") -> Iterator[str]:
-    for name, value in tables.items():
-        if isinstance(value, Mapping):
-            yield from _keys(value, f"{place}{name}.")
-        else:
-            yield f"{place}{name}"
+def _keys(tables: Mapping[str, Any]) -> list[str]:
+    return [".".join(path) for path, value in leaves(tables) if value != {}]
 
 
 def _shipped(folder: str = "") -> Iterator[str]:

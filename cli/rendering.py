@@ -5,8 +5,8 @@ from pathlib import Path
 
 import click
 
+from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.sizes import size
 
 from .frame import number, output_options, print_json
 from .progress import StageProgress

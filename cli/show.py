@@ -5,8 +5,8 @@ from typing import Any
 
 import click
 
+from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.sizes import size
 
 from .frame import make_table, output_options, print_json, print_table, remark
 from .places import DATASET_PATH

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.sizes import size
 
 from .frame import duration, fail_incomplete, output_options, print_json
 from .options import PROCESSES

@@ -47,11 +47,11 @@ from .foundation.errors import SelectionError as SelectionError
 from .foundation.errors import TcmrlError as TcmrlError
 from .foundation.errors import TierError as TierError
 from .foundation.errors import TrainingError as TrainingError
+from .foundation.machine import parse_bytes as parse_bytes
 from .foundation.seeding import NO_TASK as NO_TASK
 from .foundation.seeding import Purpose as Purpose
 from .foundation.seeding import keyed_generator as keyed_generator
 from .foundation.seeding import keyed_seed as keyed_seed
-from .foundation.sizes import parse_bytes as parse_bytes
 from .interchange.exporting import ExportReport as ExportReport
 from .interchange.exporting import export_dataset as export_dataset
 from .interchange.formats.base import FORMATS as FORMATS
@@ -79,12 +79,12 @@ from .quality.scores import measure_quality as measure_quality
 from .quality.transfer import measure_transfer as measure_transfer
 from .quality.worth import measure_worth as measure_worth
 from .recipe.document import apply_overrides as apply_overrides
-from .recipe.listing import list_environments as list_environments
 from .recipe.profile import PROFILES as PROFILES
 from .recipe.profile import Profile as Profile
 from .recipe.recipe import Recipe as Recipe
 from .recipe.recipe import load_recipe as load_recipe
 from .recipe.tasks import parse_indices as parse_indices
+from .recipe.values import list_environments as list_environments
 from .recipe.values import recipe_values as recipe_values
 from .rendering.render import Rendered as Rendered
 from .rendering.render import render_episode as render_episode

@@ -10,8 +10,14 @@ import tcmrl_data
 from tcmrl_data import Dataset, Recipe
 from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.errors import RecipeError
-from tcmrl_data.foundation.licences import joined_licences, licence_problem
-from tcmrl_data.recipe.about import About, Reference, merged_about, read_about
+from tcmrl_data.recipe.about import (
+    About,
+    Reference,
+    joined_licences,
+    licence_problem,
+    merged_about,
+    read_about,
+)
 from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
 from tests.datasets import part_ids
 

@@ -9,7 +9,7 @@ from tcmrl_cli.data import data
 from tcmrl_cli.frame import duration
 from tcmrl_cli.progress import Pace, StageProgress
 
-from tcmrl_data.foundation.sizes import size
+from tcmrl_data.foundation.machine import size
 from tests.commands import in_process
 from tests.conftest import TINY
 from tests.terminal import as_in_terminal, assert_fits, show_in_terminal

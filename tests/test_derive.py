@@ -14,7 +14,7 @@ import tcmrl_data
 from tcmrl_data import TIERS, Dataset, derive_dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TierError
-from tcmrl_data.foundation.ranges import count_ranges, read_ranges, write_ranges
+from tcmrl_data.foundation.records import count_ranges, read_ranges, write_ranges
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
 from tcmrl_data.store.part_record import References

@@ -14,7 +14,7 @@ import tcmrl_data
 from tcmrl_data import BuildEvent, Dataset
 from tcmrl_data.building.events import EventLog
 from tcmrl_data.foundation.errors import BuildError, CacheError, StorageError
-from tcmrl_data.foundation.sizes import size
+from tcmrl_data.foundation.machine import size
 from tcmrl_data.sampling.cache import cached_rows
 from tests.conftest import TASKS, TINY
 from tests.disks import COMMAND_LINE, read_only, run_mounted, small_disk

@@ -8,11 +8,10 @@ import pytest
 from tcmrl_data import Recipe, apply_overrides, canonical_json, list_environments, load_recipe
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
-from tcmrl_data.recipe.comments import read_comments
 from tcmrl_data.recipe.profile import PROFILES, Profile
 from tcmrl_data.recipe.recipe import full_settings
 from tcmrl_data.recipe.tasks import choose_tasks
-from tcmrl_data.recipe.values import recipe_values
+from tcmrl_data.recipe.values import read_comments, recipe_values
 from tests.environments import some_members
 
 

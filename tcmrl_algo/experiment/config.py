@@ -12,9 +12,9 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data import CheckpointError, Profile, TrainingError
-from tcmrl_data.foundation.canonical import parse_json
+from tcmrl_data.foundation.canonical import leaves, parse_json
 from tcmrl_data.foundation.plugins import unknown_name
-from tcmrl_data.foundation.validation import validate_table
+from tcmrl_data.foundation.records import validate_table
 
 Metric = Literal[
     "final",
@@ -265,13 +265,9 @@ def run_id(environment: str, method: str, seed: int, fold: int | None = None) ->
     return f"{folder_name(environment)}--{folder_name(method)}--seed{seed}{part}"
 
 
-def override_texts(table: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+def override_texts(table: Mapping[str, Any]) -> Iterator[str]:
     """Nested tables as the `section.key=value` texts that `resolve` takes; JSON values are TOML values."""
-    for key, value in table.items():
-        if isinstance(value, Mapping):
-            yield from override_texts(value, f"{prefix}{key}.")
-        else:
-            yield f"{prefix}{key}={json.dumps(value)}"
+    return (f"{'.'.join(path)}={json.dumps(value)}" for path, value in leaves(table) if value != {})
 
 
 def _without_steps(training: Mapping[str, Any]) -> dict[str, Any]:

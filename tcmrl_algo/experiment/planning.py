@@ -11,6 +11,7 @@ from tcmrl_algo.experiment.datasets import fold_datasets, open_datasets
 from tcmrl_algo.experiment.results import Tuned
 from tcmrl_algo.training.config import TrainingConfig, installed_table, resolve
 from tcmrl_data import CheckpointError, Dataset, TcmrlError, TrainingError
+from tcmrl_data.foundation.canonical import leaves
 
 TunedSettings = Mapping[str, Mapping[str, Tuned]]
 """Tuned settings by environment and algorithm."""
@@ -177,7 +178,7 @@ def check_same(done: Mapping[str, Any], planned: Mapping[str, Any], *, place: Pa
     Raises:
         CheckpointError: names the first value that differs.
     """
-    before, now = dict(_leaves(completed(done))), dict(_leaves(planned))
+    before, now = _values(completed(done)), _values(planned)
     for key in sorted(before.keys() | now.keys()):
         if before.get(key) != now.get(key):
             raise CheckpointError(
@@ -252,11 +253,7 @@ def _config(
     return config
 
 
-def _leaves(value: Any, prefix: str = "") -> list[tuple[str, Any]]:
-    if isinstance(value, Mapping):
-        return [
-            leaf
-            for key, item in value.items()
-            for leaf in _leaves(item, f"{prefix}.{key}".removeprefix(".").removeprefix("training."))
-        ]
-    return [(prefix, value)]
+def _values(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The settings by dotted names, those of training without its name."""
+    named = {".".join(path): value for path, value in leaves(settings) if value != {}}
+    return {name.removeprefix("training."): value for name, value in named.items()}

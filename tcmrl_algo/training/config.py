@@ -12,7 +12,7 @@ from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data import Dataset, Profile, TrainingError, apply_overrides, load_recipe
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
 from tcmrl_data.foundation.plugins import check_declared
-from tcmrl_data.foundation.validation import validate_table
+from tcmrl_data.foundation.records import validate_table
 
 TrainingSource = Literal["table", "recipe", "defaults"]
 """Whence a method's own settings: the given table, the installed recipe's, or the method's defaults."""

@@ -24,7 +24,7 @@ from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.disk import make_folders, write_tree
 from tcmrl_data.foundation.errors import SnapshotError
 from tcmrl_data.foundation.plain_files import one_line, open_plain_file, printable
-from tcmrl_data.foundation.validation import first_problem
+from tcmrl_data.foundation.records import first_problem
 
 LARGEST_FILE = 2**29
 FLOOR_BYTES = 2**20

@@ -15,7 +15,7 @@ from tcmrl_data.engine.base import BaseEngine, make_engine
 from tcmrl_data.foundation.canonical import differences
 from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
-from tcmrl_data.foundation.sizes import size
+from tcmrl_data.foundation.machine import size
 from tcmrl_data.recipe.recipe import Recipe, full_settings
 from tcmrl_data.store.keys import PARTS
 from tcmrl_data.store.manifest import MANIFEST, read_manifest

@@ -13,7 +13,7 @@ from tcmrl_data.building.published import Published
 from tcmrl_data.building.unit import UnitSpec
 from tcmrl_data.engine.base import BaseEngine, Result, Unit
 from tcmrl_data.envs.tasks import Task
-from tcmrl_data.foundation.shared_folder import VISIBLE_SECONDS
+from tcmrl_data.foundation.locks import VISIBLE_SECONDS
 from tcmrl_data.store.keys import PartKey, part_file
 
 WORKER = "tcmrl_data.building.worker"

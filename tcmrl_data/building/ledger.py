@@ -16,9 +16,9 @@ from tcmrl_data.foundation.errors import (
     StoreError,
     UnreadableError,
 )
+from tcmrl_data.foundation.locks import wait_until_visible
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem, status_of
-from tcmrl_data.foundation.shared_folder import wait_until_visible
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_file, part_folder

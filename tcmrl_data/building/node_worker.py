@@ -9,7 +9,7 @@ from typing import Any
 
 from tcmrl_data.engine.worker import Send, serve
 from tcmrl_data.foundation.canonical import canonical_json
-from tcmrl_data.foundation.shared_folder import wait_until_visible
+from tcmrl_data.foundation.locks import wait_until_visible
 
 
 def work(spec: dict[str, Any], report: Send) -> str:

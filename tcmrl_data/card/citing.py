@@ -9,8 +9,7 @@ from typing import Any, Literal, get_args
 
 from tcmrl_data.card.yaml_text import yaml_text
 from tcmrl_data.foundation.errors import TcmrlError
-from tcmrl_data.foundation.licences import AND, LICENCES
-from tcmrl_data.recipe.about import Reference
+from tcmrl_data.recipe.about import AND, Reference, is_listed
 from tcmrl_data.recipe.recipe import load_recipe
 from tcmrl_data.store.manifest import Manifest
 
@@ -157,7 +156,7 @@ def _bibtex_author(name: str) -> str:
 
 def _cff(citation: Citation) -> str:
     """The Citation File Format, version 1.2.0 (https://citation-file-format.github.io)."""
-    listed = [licence for licence in citation.licences if licence in LICENCES]
+    listed = [licence for licence in citation.licences if is_listed(licence)]
     fields: dict[str, Any] = {
         "cff-version": "1.2.0",
         "message": "Cite this dataset with the works that it is from, listed as its references.",

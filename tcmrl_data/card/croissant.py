@@ -16,7 +16,7 @@ from tcmrl_data.card.citing import citation_of, citation_text
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.disk import STAGING, replace_file
-from tcmrl_data.foundation.licences import LICENCES
+from tcmrl_data.recipe.about import is_listed
 from tcmrl_data.store.keys import PARTS, part_file
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part_table import PartEntry
@@ -129,7 +129,7 @@ def croissant_document(dataset: Dataset, digests: Mapping[str, str]) -> dict[str
 
 
 def _licence(name: str) -> str:
-    return f"https://spdx.org/licenses/{name}.html" if name in LICENCES else name
+    return f"https://spdx.org/licenses/{name}.html" if is_listed(name) else name
 
 
 def _creator(name: str) -> dict[str, str]:

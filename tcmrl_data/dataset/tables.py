@@ -11,7 +11,7 @@ from tcmrl_data.dataset.view import View
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Split, Task, draw_tasks
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, TaskError, TcmrlError
-from tcmrl_data.foundation.validation import first_problem
+from tcmrl_data.foundation.records import first_problem
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.manifest import MANIFEST, Manifest
 from tcmrl_data.store.part_record import References

@@ -13,8 +13,7 @@ from pydantic import Field, model_validator
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, digest, parse_json
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
-from tcmrl_data.foundation.ranges import count_ranges, read_ranges
-from tcmrl_data.foundation.records import Record, parse_record
+from tcmrl_data.foundation.records import Record, count_ranges, parse_record, read_ranges
 from tcmrl_data.store.keys import RUN_NAME, PartKey
 from tcmrl_data.store.limits import MAX_STEPS, MAX_TASKS
 from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, Totals

@@ -16,8 +16,7 @@ from typing import Any, final
 from tcmrl_data.engine._attempt import GRACE_SECONDS, Outcome, run_attempt
 from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, NodeReport, Result, Unit, longest_first
 from tcmrl_data.foundation.errors import BuildError
-from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.foundation.sizes import size
+from tcmrl_data.foundation.machine import available_cores, size
 
 LOST_RETRIES = 3
 """How often Ray repeats an attempt whose machine was lost."""

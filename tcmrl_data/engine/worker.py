@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Any
 
 from tcmrl_data.foundation.errors import TcmrlError
-from tcmrl_data.foundation.torch_compiler import leave_out_compiler
+from tcmrl_data.foundation.startup import leave_out_compiler
 
 REPORT_SECONDS = 0.5
 

@@ -30,6 +30,15 @@ def digest(value: Any) -> str:
     return sha256(canonical_json(value))
 
 
+def leaves(tables: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Path and value of every value within nested tables; an empty table counts as a value."""
+    for key, value in tables.items():
+        if isinstance(value, Mapping) and value:
+            yield from leaves(value, (*path, key))
+        else:
+            yield (*path, key), value
+
+
 def differences(left: Any, right: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
     """Place, such as `sac.steps`, and both values of everything that differs in two JSON values.
 

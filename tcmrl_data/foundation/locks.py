@@ -1,4 +1,4 @@
-"""Exclusive and shared locks on open files, which also hold between machines that share a folder over NFS.
+"""Locks on open files that hold between machines which share a folder over NFS, and waiting for their files.
 
 On Linux a lock is an open file description lock of `fcntl`, for three reasons:
 
@@ -8,13 +8,20 @@ On Linux a lock is an open file description lock of `fcntl`, for three reasons:
   exclude each other, and closing another descriptor of the same file does not release it.
 - NFS passes it to the server, and grants it to a file that is open for writing; a shared one, for reading.
 
+The package `filelock` takes `flock`, which nobody can ask for without taking it, or makes a file, which a
+killed
+holder leaves. The kernel releases these locks when their holder ends, however it ends.
+
 Other systems have no such locks; there `flock` is used, and a writer waits while others ask.
 """
 
+import contextlib
 import errno
 import fcntl
+import os
 import struct
 import time
+from pathlib import Path
 from typing import IO, Any
 
 HAS_OPEN_FILE_LOCKS = hasattr(fcntl, "F_OFD_SETLK")
@@ -107,3 +114,38 @@ def _try_flock(file: IO[Any], kind: int) -> bool:
     except BlockingIOError:
         return False
     return True
+
+
+VISIBLE_SECONDS = 60.0
+"""NFS may remember the content of a folder for this long (its option `acdirmax`)."""
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.05, 2.0
+
+
+def wait_until_visible(path: Path, *, deadline: float = VISIBLE_SECONDS) -> bool:
+    """Waits for a file or folder that another machine says it has made.
+
+    Args:
+        path: the file or folder.
+        deadline: seconds to wait at most; a path that is there is never waited for.
+
+    Returns:
+        False if it is not there at the deadline.
+    """
+    end, pause = time.monotonic() + deadline, FIRST_PAUSE
+    while not path.exists():
+        left = end - time.monotonic()
+        if left <= 0:
+            return False
+        time.sleep(min(pause, left))
+        pause = min(2 * pause, LONGEST_PAUSE)
+        _look_again(path.parent)
+    return True
+
+
+def _look_again(folder: Path) -> None:
+    """Makes NFS ask the server what is in a folder, or in the next one above that is there."""
+    for place in (folder, *folder.parents):
+        with contextlib.suppress(OSError):
+            os.listdir(place)
+            return

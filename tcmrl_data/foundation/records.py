@@ -1,6 +1,12 @@
 """Records as JSON files, and strict parsing of untrusted ones."""
 
+import difflib
+import json
+import re
+import types
+import typing
 import unicodedata
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,7 +16,6 @@ from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import CheckpointError, ManifestError, TcmrlError
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.validation import first_problem
 
 HIDDEN_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Unicode categories of control, format and surrogate characters and of line separators."""
@@ -121,3 +126,120 @@ def _is_hidden(text: str, *, allowed: str) -> bool:
         unicodedata.category(character) in HIDDEN_CATEGORIES and character not in allowed
         for character in text
     )
+
+
+Table = TypeVar("Table", bound=BaseModel)
+
+
+def validate_table(
+    kind: type[Table], values: Mapping[str, Any], *, place: str, error: type[TcmrlError], table: str = ""
+) -> Table:
+    """Validates a table strictly, except that a list is accepted for a tuple.
+
+    Args:
+        kind: the settings class.
+        values: the table, as parsed from TOML.
+        place: origin of the table, for the error message.
+        error: class of the error to raise.
+        table: dotted path of the table within its origin.
+
+    Raises:
+        TcmrlError: of class `error`, with the first problem in one line.
+    """
+    try:
+        return kind.model_validate_json(json.dumps(values, default=str), strict=True)
+    except ValidationError as problem:
+        raise error(f"{place}: {first_problem(problem, kind=kind, table=table)}") from None
+
+
+def first_problem(error: ValidationError, *, kind: type[BaseModel] | None = None, table: str = "") -> str:
+    """The first problem of a validation error in one line: field, rule, value.
+
+    Args:
+        error: the error raised by pydantic.
+        kind: the settings class; if given, the message for an unknown key suggests similar keys.
+        table: dotted path to put in front of the field.
+    """
+    detail = error.errors()[0]
+    place = detail["loc"]
+    field = ".".join([*filter(None, [table]), *map(str, place)]) or "values"
+    more = "" if error.error_count() == 1 else f" (and {error.error_count() - 1} more)"
+    if kind is not None and detail["type"] == "extra_forbidden":
+        return f"unknown key {field}; {nearest(str(place[-1]), known_keys(kind, place[:-1]))}{more}"
+    given = "" if detail["type"] in ("missing", "value_error") else f", got {str(detail['input'])[:80]!r}"
+    return f"{field}: {detail['msg']}{given}{more}"
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """A suggestion of known names, for the end of an error message about an unknown name."""
+    names = sorted(known)
+    found = difflib.get_close_matches(name, names, n=3)
+    return f"did you mean {', '.join(found)}?" if found else f"known are {', '.join(names)}"
+
+
+def known_keys(kind: Any, place: Sequence[str | int]) -> list[str]:
+    """The keys that a nested table of a settings class may have; empty if the value is not a table.
+
+    Args:
+        kind: a settings class, or the type of one of its fields.
+        place: keys and indices that lead from `kind` to the nested table.
+    """
+    if isinstance(kind, type) and issubclass(kind, BaseModel):
+        fields = {field.alias or name: field.annotation for name, field in kind.model_fields.items()}
+        if not place:
+            return list(fields)
+        return known_keys(fields.get(str(place[0])), place[1:])
+    members = [member for member in typing.get_args(kind) if member is not Ellipsis]
+    if typing.get_origin(kind) in (typing.Union, types.UnionType, typing.Annotated):
+        return next(filter(None, (known_keys(member, place) for member in members)), [])
+    return known_keys(members[-1], place[1:]) if members and place else []
+
+
+_RANGE = re.compile(r"(0|[1-9][0-9]{0,9})(?:-([1-9][0-9]{0,9}))?")
+
+
+def write_ranges(indices: Iterable[int]) -> str:
+    """The text of some indices, ascending, each once; empty where there is none.
+
+    Example:
+        >>> write_ranges([12, 0, 1, 2])
+        '0-2,12'
+    """
+    ranges: list[list[int]] = []
+    for index in sorted(set(indices)):
+        if ranges and ranges[-1][1] == index - 1:
+            ranges[-1][1] = index
+        else:
+            ranges.append([index, index])
+    return ",".join(str(first) if first == last else f"{first}-{last}" for first, last in ranges)
+
+
+def read_ranges(text: str, *, limit: int) -> list[int]:
+    """The inverse of `write_ranges`, for text of unknown origin.
+
+    Args:
+        text: the text.
+        limit: indices lie below it.
+
+    Raises:
+        ValueError: the text is not one that `write_ranges` gives, or an index is too large.
+    """
+    return [index for first, last in _spans(text, limit) for index in range(first, last + 1)]
+
+
+def count_ranges(text: str, *, limit: int) -> int:
+    """The number of indices in a text, without making a list of them; arguments and errors as above."""
+    return sum(last - first + 1 for first, last in _spans(text, limit))
+
+
+def _spans(text: str, limit: int) -> list[tuple[int, int]]:
+    spans: list[tuple[int, int]] = []
+    for item in text.split(",") if text else ():
+        match = _RANGE.fullmatch(item)
+        if match is None:
+            raise ValueError(f"{item[:40]!r} is neither an index nor a range such as 0-9")
+        first, last = int(match[1]), int(match[2] or match[1])
+        if (match[2] and last <= first) or last >= limit or (spans and first <= spans[-1][1] + 1):
+            raise ValueError(f"{text[:80]!r} does not hold ascending ranges of indices below {limit}")
+        spans.append((first, last))
+    return spans

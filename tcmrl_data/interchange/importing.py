@@ -11,15 +11,13 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, digest
 from tcmrl_data.foundation.errors import StoreError, TaskError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
-from tcmrl_data.foundation.records import hidden_text
-from tcmrl_data.foundation.validation import validate_table
+from tcmrl_data.foundation.records import hidden_text, validate_table
 from tcmrl_data.interchange.optional import require_packages
 from tcmrl_data.interchange.readers.base import READERS, Reader, ReadPart, Say, say_nothing
 from tcmrl_data.interchange.readers.source_files import path_digest
 from tcmrl_data.interchange.survey import Survey
 from tcmrl_data.operations.assembly import Assembly, derivation_of, open_assembly
-from tcmrl_data.recipe.foreign import bound_recipe, check_licence, foreign_recipe
-from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.recipe.recipe import Recipe, bound_recipe, check_licence, foreign_recipe
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.limits import check_plan
 from tcmrl_data.store.manifest import Run

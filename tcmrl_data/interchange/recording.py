@@ -18,7 +18,7 @@ from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replac
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.interchange.readers.episodes import Cuts, episode
 from tcmrl_data.operations.assembly import derivation_of, open_assembly
-from tcmrl_data.recipe.foreign import bound_recipe, check_licence, foreign_recipe
+from tcmrl_data.recipe.recipe import bound_recipe, check_licence, foreign_recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_folder

@@ -24,7 +24,7 @@ from tcmrl_data.foundation.disk import (
 )
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.foundation.plain_files import read_plain_file
-from tcmrl_data.foundation.ranges import write_ranges
+from tcmrl_data.foundation.records import write_ranges
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.limits import MAX_PARTS

@@ -7,7 +7,7 @@ from typing import Any
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.foundation.ranges import count_ranges, read_ranges, write_ranges
+from tcmrl_data.foundation.records import count_ranges, read_ranges, write_ranges
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.keys import PartKey

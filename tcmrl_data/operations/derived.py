@@ -7,8 +7,7 @@ from pydantic import ValidationError
 
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.records import Record
-from tcmrl_data.foundation.validation import first_problem
+from tcmrl_data.foundation.records import Record, first_problem
 
 Settings = TypeVar("Settings", bound=Record)
 

@@ -9,7 +9,7 @@ from tcmrl_data.dataset.view import VIEW_SCHEMA, ViewedParts, is_view_file
 from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.ranges import write_ranges
+from tcmrl_data.foundation.records import write_ranges
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import MANIFEST, Derivation
 from tcmrl_data.store.sealing import totals_of

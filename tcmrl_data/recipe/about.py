@@ -7,8 +7,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from tcmrl_data.foundation.errors import RecipeError
-from tcmrl_data.foundation.licences import joined_licences, licence_problem
-from tcmrl_data.foundation.validation import validate_table
+from tcmrl_data.foundation.records import validate_table
 
 Text = Annotated[str, Field(min_length=1)]
 
@@ -16,6 +15,42 @@ DOI = re.compile(r"10\.\d{4,9}(\.\d+)?/[A-Za-z0-9:/_;\-.()\[\]\\]+")
 """The form that the Citation File Format 1.2 asks of a DOI."""
 
 URL = re.compile(r"https?://[^\s\"<>{}|\\^`]+")
+
+
+AND = " AND "
+
+
+def licence_problem(text: str) -> str | None:
+    """Why a text is no licence, in words for an error message; None if it is one.
+
+    A licence is an SPDX identifier, a `LicenseRef-NAME`, or several of them joined by `AND` or `OR`.
+    """
+    for name in re.split(" AND | OR ", text):
+        spelled = _spelled(name) or _spelled(name.replace(" ", "-"))
+        if spelled != name:
+            meant = f"did you mean {spelled}? " if spelled else "see https://spdx.org/licenses. "
+            return f"{name[:80]!r} is no SPDX licence; {meant}One of your own is written LicenseRef-NAME"
+    return None
+
+
+def _spelled(name: str) -> str | None:
+    """A licence as SPDX spells it; None if SPDX does not know it."""
+    from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
+
+    try:
+        return canonicalize_license_expression(name)
+    except InvalidLicenseExpression:
+        return None
+
+
+def is_listed(name: str) -> bool:
+    """Whether a text is one identifier of the SPDX licence list."""
+    return _spelled(name) == name and " " not in name and not name.startswith("LicenseRef-")
+
+
+def joined_licences(licences: list[str]) -> str:
+    """The licence of something that is under all the given ones, each named once, in order."""
+    return AND.join(sorted({name for licence in licences for name in licence.split(AND)}))
 
 
 class _Plain(BaseModel):

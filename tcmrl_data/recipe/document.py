@@ -8,7 +8,7 @@ from typing import Any
 
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
-from tcmrl_data.foundation.validation import nearest
+from tcmrl_data.foundation.records import nearest
 from tcmrl_data.recipe.profile import PROFILES, Profile
 
 RECIPE_SCHEMA = 1

@@ -10,10 +10,11 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorSource
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment, Reward, TaskSplit, make_environment
 from tcmrl_data.envs.controller import View
+from tcmrl_data.envs.foreign import Foreign
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.errors import RecipeError, TcmrlError
-from tcmrl_data.foundation.validation import validate_table
-from tcmrl_data.recipe.about import About, read_about
+from tcmrl_data.foundation.records import validate_table
+from tcmrl_data.recipe.about import About, licence_problem, read_about
 from tcmrl_data.recipe.document import merge_tables, open_recipe, read_override
 from tcmrl_data.recipe.profile import Profile
 
@@ -252,3 +253,98 @@ def _behavior_table(tables: Mapping[str, Any], place: str) -> BehaviorTable:
     values = merge_tables(extended if isinstance(extended, Mapping) else {}, tables[own.source])
     settings = validate_table(kind.Settings, values, place=place, error=RecipeError, table=table)
     return BehaviorTable(**own.model_dump(), settings=settings.model_dump(mode="json"))
+
+
+UNKNOWN = "unknown"
+UNKNOWN_BEHAVIOR = BehaviorTable(source=UNKNOWN, settings={})
+"""Of episodes whose policies nobody has described; no behavior source has this name."""
+
+
+def foreign_recipe(
+    *,
+    tasks: int,
+    train: int,
+    horizon: int,
+    observation_dim: int,
+    action_dim: int,
+    extra_arrays: Mapping[str, str],
+    licence: str | None,
+) -> Recipe:
+    """The recipe of data of an unknown environment.
+
+    A manifest always has a recipe: that is where samplers, exports, `inspect` and training look for sizes,
+    horizon and training tables, which thus need no second path for imported data.
+
+    Args:
+        tasks: number of tasks.
+        train: number of training tasks.
+        horizon: steps of the longest episode.
+        observation_dim: width of observations.
+        action_dim: width of actions.
+        extra_arrays: dtypes of further per-step arrays, by name.
+        licence: of the data; None where it is not known.
+    """
+    environment = {
+        "name": Foreign.name,
+        "task_seed": 0,
+        "tasks": tasks,
+        "train": train,
+        "horizon": horizon,
+        "reward_density": "dense",
+        "observation_dim": observation_dim,
+        "action_dim": action_dim,
+        "extra_arrays": dict(extra_arrays),
+    }
+    return Recipe(
+        profile="paper",
+        about=About(
+            description="data of an environment that is not known here",
+            citation=UNKNOWN,
+            licence=licence or UNKNOWN,
+        ),
+        environment=EnvironmentTable.model_validate(environment),
+        behavior=UNKNOWN_BEHAVIOR,
+        rollouts=NoRollouts(),
+        build=TaskChoice(),
+        training={"paper": {}},
+    )
+
+
+def bound_recipe(environment: str, *, licence: str | None) -> Recipe:
+    """The recipe of data that come from one of our environments, but not from a build of it.
+
+    Args:
+        environment: its name.
+        licence: of the data; None where it is not known.
+
+    Raises:
+        UnknownNameError: there is no such environment.
+    """
+    recipe = load_recipe(environment)
+    return recipe.model_copy(
+        update={
+            "about": recipe.about.model_copy(
+                update={
+                    "citation": UNKNOWN,
+                    "licence": licence or UNKNOWN,
+                    "authors": (),
+                    "url": None,
+                    "doi": None,
+                }
+            ),
+            "behavior": UNKNOWN_BEHAVIOR,
+            "rollouts": NoRollouts(),
+            "build": TaskChoice(),
+        }
+    )
+
+
+def check_licence(licence: str | None) -> None:
+    """Checks the licence that someone gives for data from elsewhere.
+
+    Raises:
+        RecipeError: SPDX does not know it.
+    """
+    problem = None if licence is None else licence_problem(licence)
+    if problem:
+        raise RecipeError(f"licence: {problem}")

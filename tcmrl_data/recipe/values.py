@@ -1,15 +1,23 @@
-"""What `tcmrl-data recipe` shows: the values of a recipe, and where they come from."""
+"""What recipes say: their values with the comments on where they come from, and the list of environments."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES
-from tcmrl_data.recipe.comments import KeyPath, leaf_paths, read_comments
+from tcmrl_data.envs.base import ENVIRONMENTS
+from tcmrl_data.foundation.canonical import leaves
+from tcmrl_data.foundation.errors import TcmrlError
+from tcmrl_data.foundation.plugins import one_line_error
 from tcmrl_data.recipe.document import RecipeDocument, open_recipe, read_override
 from tcmrl_data.recipe.profile import Profile
 from tcmrl_data.recipe.recipe import Recipe, load_recipe
+
+if TYPE_CHECKING:
+    from tomlkit.items import Item, Key
+
+KeyPath = tuple[str, ...]
 
 NOT_SHOWN = {("environment", "name"), ("about", "references")}
 """Keys that `--set` does not take: a name that has no effect, and a list of tables."""
@@ -47,7 +55,7 @@ def recipe_values(
     recipe = load_recipe(name_or_file, profile=profile, overrides=overrides)
     sources = _sources(document, profile, overrides)
     tables = document.tables(profile, overrides)
-    written = {path: _value_at(tables, path) for path in leaf_paths(tables)}
+    written = dict(leaves(tables))
     own = recipe.behavior.source
     extended = ("behavior", BEHAVIOR_SOURCES.get(own).extends or own)
     known = {*written, *(("behavior", own, *path[2:]) for path in written if path[:2] == extended)}
@@ -74,8 +82,7 @@ def _sources(document: RecipeDocument, profile: Profile, overrides: Sequence[str
                 sources[path[len(layer) :]] = ": ".join([*said, *filter(None, [comment])])
     for text in overrides:
         keys, value = read_override(text)
-        paths = leaf_paths({"": value})
-        sources |= {(*keys, *path[1:]): "--set" for path in paths}
+        sources |= {(*keys, *path[1:]): "--set" for path, _ in leaves({"": value})}
     return sources
 
 
@@ -84,11 +91,96 @@ def _resolved(recipe: Recipe) -> dict[KeyPath, Any]:
     behavior = recipe.behavior.model_dump(mode="json")
     behavior[recipe.behavior.source] = behavior.pop("settings")
     tables = recipe.unit_settings() | {"behavior": behavior, "build": recipe.build.model_dump(mode="json")}
-    return {path: _value_at(tables, path) for path in leaf_paths(tables)}
+    return dict(leaves(tables))
 
 
-def _value_at(tables: Mapping[str, Any], path: KeyPath) -> Any:
-    value: Any = tables
-    for key in path:
-        value = value[key]
-    return value
+def read_comments(text: str) -> dict[KeyPath, str]:
+    """The comment of every value of a valid TOML text, empty where there is none.
+
+    A value's comment is the one behind it; where there is none, the lines of comment directly above it;
+    where there are none, the lines of comment directly below the header of its table.
+    """
+    import tomlkit
+
+    comments: dict[KeyPath, str] = {}
+    _collect_comments(tomlkit.parse(text).body, (), comments)
+    return comments
+
+
+def _collect_comments(
+    body: Iterable[tuple["Key | None", "Item"]],
+    table: KeyPath,
+    comments: dict[KeyPath, str],
+    *,
+    of_table: str = "",
+    is_below_header: bool = False,
+) -> None:
+    """Adds the comments of a table's values; of_table: the comment of a value that has no other."""
+    from tomlkit.items import AoT, Comment, Table
+
+    above: list[str] = []
+    for key, item in body:
+        if key is None:
+            if isinstance(item, Comment):
+                above.append(_comment(item))
+            else:  # an empty line
+                above, is_below_header = [], False
+            continue
+        place = (*table, key.key)
+        of_table = " ".join(above) if is_below_header else of_table
+        if isinstance(item, AoT):
+            for member in item.body:
+                _collect_comments(member.value.body, place, comments, is_below_header=True)
+        elif isinstance(item, Table) and item.display_name is not None:  # it has a header
+            _collect_comments(item.value.body, place, comments, is_below_header=True)
+        elif isinstance(item, Table):  # of a dotted key
+            _collect_comments(item.value.body, place, comments, of_table=" ".join(above) or of_table)
+        else:
+            comment = _comment(item) or " ".join(above) or of_table
+            comments |= {(*table, *path): comment for path, _ in leaves({key.key: item.unwrap()})}
+        above, is_below_header = [], False
+
+
+def _comment(item: "Item") -> str:
+    return item.trivia.comment[1:].strip()
+
+
+@dataclass(frozen=True)
+class EnvironmentList:
+    """The environments of all installed packages.
+
+    Attributes:
+        environments: name, dimensions, horizon and task counts, by name.
+        broken: one line of error, by name of plug-in or environment.
+    """
+
+    environments: tuple[dict[str, Any], ...]
+    broken: dict[str, str]
+
+
+def list_environments() -> EnvironmentList:
+    """Every environment that has a recipe; one that fails is listed as broken and harms no other."""
+    rows, broken = [], ENVIRONMENTS.broken()
+    for name in ENVIRONMENTS.members():
+        try:
+            if ENVIRONMENTS.get(name).recipe_file(name).is_file():
+                rows.append(_row(name))
+        except TcmrlError as error:
+            broken[name] = str(error)
+        except Exception as error:  # noqa: BLE001 # another package's code may raise anything
+            broken[name] = f"environment {name!r} is broken: {one_line_error(error)}"
+    return EnvironmentList(tuple(rows), broken)
+
+
+def _row(name: str) -> dict[str, Any]:
+    environment = load_recipe(name).make_environment()
+    settings = environment.settings
+    return {
+        "name": name,
+        "observation_dim": environment.observation_dim,
+        "action_dim": environment.action_dim,
+        "horizon": settings.horizon,
+        "tasks": settings.tasks,
+        "train": settings.train,
+        "test": settings.tasks - settings.train,
+    }

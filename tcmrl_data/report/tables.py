@@ -7,8 +7,8 @@ from typing import Any
 
 from tcmrl_data.dataset.returns import summarize_returns
 from tcmrl_data.dataset.tiers import TIERS
+from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.sizes import size
 from tcmrl_data.page.markup import Markup, details, element, table
 from tcmrl_data.report.content import Content
 

@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING
 
 from tcmrl_data.foundation.errors import CacheError, StorageError
 from tcmrl_data.foundation.locks import take_shared_lock
-from tcmrl_data.foundation.machine import available_memory
-from tcmrl_data.foundation.sizes import parse_bytes, size
+from tcmrl_data.foundation.machine import available_memory, parse_bytes, size
 from tcmrl_data.sampling.cache_entry import (
     RECORD,
     entry_bytes,

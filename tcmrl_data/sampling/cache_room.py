@@ -28,7 +28,7 @@ from tcmrl_data.foundation.disk import (
 )
 from tcmrl_data.foundation.errors import CacheError, LockedError
 from tcmrl_data.foundation.locks import is_locked, try_exclusive_lock
-from tcmrl_data.foundation.sizes import size
+from tcmrl_data.foundation.machine import size
 from tcmrl_data.sampling.cache_entry import RECORD, ROWS, read_entry
 
 WAIT_SECONDS = 0.2

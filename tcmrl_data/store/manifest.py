@@ -11,10 +11,9 @@ from pydantic import FailFast, Field, field_validator, model_validator
 from tcmrl_data.envs.tasks import Split
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, canonical_json, digest, parse_json
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.licences import AND, joined_licences
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
-from tcmrl_data.foundation.ranges import read_ranges
-from tcmrl_data.foundation.records import Record, parse_record
+from tcmrl_data.foundation.records import Record, parse_record, read_ranges
+from tcmrl_data.recipe.about import AND, joined_licences
 from tcmrl_data.recipe.profile import Profile
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.keys import RUN_NAME

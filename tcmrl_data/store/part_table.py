@@ -17,7 +17,7 @@ from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.validation import first_problem
+from tcmrl_data.foundation.records import first_problem
 from tcmrl_data.store.keys import RUN_NAME, PartKey
 from tcmrl_data.store.limits import MAX_COUNT, MAX_INDEX, MAX_PLATFORMS
 from tcmrl_data.store.part_record import SHA256, PartRecord

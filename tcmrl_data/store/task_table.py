@@ -10,8 +10,7 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import canonical_json, parse_json
 from tcmrl_data.foundation.errors import ManifestError, TaskError
 from tcmrl_data.foundation.plain_files import one_line, printable
-from tcmrl_data.foundation.records import Record, hidden_text
-from tcmrl_data.foundation.validation import first_problem
+from tcmrl_data.foundation.records import Record, first_problem, hidden_text
 from tcmrl_data.store.limits import MAX_INDEX
 from tcmrl_data.store.tables import blocks
 

@@ -14,7 +14,7 @@ from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Split, Task, draw_tasks
 from tcmrl_data.foundation.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
 from tcmrl_data.foundation.plain_files import words_after
-from tcmrl_data.foundation.validation import first_problem
+from tcmrl_data.foundation.records import first_problem
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import array_digests, read_arrays, unpack

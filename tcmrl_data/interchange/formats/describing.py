@@ -9,7 +9,7 @@ from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.licences import AND
+from tcmrl_data.recipe.about import AND
 from tcmrl_data.store.keys import PartKey
 
 

@@ -33,11 +33,11 @@ from tcmrl_data.dataset.tables import TaskReferences
 from tcmrl_data.envs.base import make_environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
-from tcmrl_data.foundation.licences import AND
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.interchange.formats.base import Format
 from tcmrl_data.interchange.formats.describing import stored_episodes, task_attributes
 from tcmrl_data.interchange.formats.new_folder import require_room_for
+from tcmrl_data.recipe.about import AND
 from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
