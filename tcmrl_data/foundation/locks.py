@@ -9,8 +9,7 @@ On Linux a lock is an open file description lock of `fcntl`, for three reasons:
 - NFS passes it to the server, and grants it to a file that is open for writing; a shared one, for reading.
 
 The package `filelock` takes `flock`, which nobody can ask for without taking it, or makes a file, which a
-killed
-holder leaves. The kernel releases these locks when their holder ends, however it ends.
+killed holder leaves behind. The kernel releases these locks when their holder ends, however it ends.
 
 Other systems have no such locks; there `flock` is used, and a writer waits while others ask.
 """
