@@ -8,11 +8,10 @@ import pytest
 from pydantic import ValidationError
 
 from tcmrl_data import Recipe, load_recipe
-from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorContext, BehaviorSource
-from tcmrl_data.behavior.checkpoints import CheckpointFolder
+from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorSource
 from tcmrl_data.envs.base import ENVIRONMENTS
-from tcmrl_data.envs.tasks import draw_tasks
 from tcmrl_data.foundation.errors import RecipeError
+from tests.training_of_behavior import context_of
 
 every = pytest.mark.parametrize("name", BEHAVIOR_SOURCES.names())
 
@@ -32,18 +31,10 @@ def source_with(name: str) -> BehaviorSource:
     return recipe_with(name).make_source()
 
 
-def first_snapshot(recipe: Recipe, folder: Path, reported: list[int]) -> tuple[int, int, str]:
+def first_snapshot(recipe: Recipe, folder: Path) -> tuple[int, int, str]:
     """Task, step and digest of the first snapshot of the first unit."""
-    environment, source = recipe.make_environment(), recipe.make_source()
-    context = BehaviorContext(
-        environment=environment,
-        tasks=draw_tasks(environment)[: min(2, source.group_size)],
-        seed=0,
-        observation=recipe.behavior.observation,
-        reward=recipe.behavior.reward,
-        report=reported.append,
-        checkpoints=lambda tasks: CheckpointFolder(folder, "unit", key="key", missing={}),
-    )
+    source = recipe.make_source()
+    context = context_of(recipe, range(min(2, source.group_size)), folder)
     task, snapshot = next(iter(source.snapshots(context)))
     return task.index, snapshot.step, snapshot.digest()
 
@@ -61,9 +52,8 @@ def test_a_source_says_what_a_build_plans_with(name: str) -> None:
 
 @every
 def test_the_first_snapshot_depends_on_recipe_task_and_seed_alone(name: str, tmp_path: Path) -> None:
-    reported: list[int] = []
-    first = first_snapshot(recipe_with(name), tmp_path / "one", reported)
-    assert first == first_snapshot(recipe_with(name), tmp_path / "two", [])
+    first = first_snapshot(recipe_with(name), tmp_path / "one")
+    assert first == first_snapshot(recipe_with(name), tmp_path / "two")
     assert first[:2] == (0, source_with(name).steps[0])
 
 

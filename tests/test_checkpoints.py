@@ -2,7 +2,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -12,25 +12,19 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import Recipe, load_recipe
-from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
-from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.events import EVENTS, BuildEvent
 from tcmrl_data.building.plan import plan_build
 from tcmrl_data.building.unit import UnitSpec, run_unit
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS
-from tcmrl_data.recipe.tasks import choose_tasks
 from tests.conftest import TINY
 from tests.datasets import part_ids
 from tests.platforms import AVX2
+from tests.training_of_behavior import assert_resumes
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
-
-
-class Interrupted(Exception):
-    """Ends a training in the middle, like a kill."""
 
 
 def folder(
@@ -42,30 +36,6 @@ def folder(
     warn: Callable[[str], None] = print,
 ) -> CheckpointFolder:
     return CheckpointFolder(dataset, "task", key=key, missing=missing, seconds=seconds, warn=warn)
-
-
-def trained(
-    recipe: Recipe, dataset: Path, stop_at: int | None = None, seconds: float = 0.0
-) -> Iterator[Snapshot]:
-    """Snapshots of the recipe's third task, with a checkpoint at the end of every episode."""
-    steps = 0
-
-    def report(count: int) -> None:
-        nonlocal steps
-        steps += count
-        if stop_at is not None and steps >= stop_at:
-            raise Interrupted
-
-    context = BehaviorContext(
-        environment=recipe.make_environment(),
-        tasks=choose_tasks(recipe, [2]),
-        seed=0,
-        observation="stored",
-        reward="stored",
-        report=report,
-        checkpoints=lambda task: folder(dataset, seconds=seconds),
-    )
-    yield from (snapshot for _, snapshot in recipe.make_source().snapshots(context))
 
 
 HOPPER = (*TINY, "behavior.sac.steps=300", "behavior.sac.snapshots=[0,200,300]")
@@ -84,20 +54,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
     tmp_path: Path, name: str, overrides: tuple[str, ...], stop_at: int
 ) -> None:
     recipe = load_recipe(name, profile="quick", overrides=overrides)
-    straight = {
-        snapshot.step: snapshot.digest()
-        for snapshot in trained(recipe, tmp_path / "straight", seconds=np.inf)
-    }
-    resumed: dict[int, str] = {}
-    interrupted = trained(recipe, tmp_path, stop_at=stop_at)
-    with pytest.raises(Interrupted):
-        resumed.update((snapshot.step, snapshot.digest()) for snapshot in interrupted)
-    state = folder(tmp_path).load()
-    assert state is not None
-    assert 0 < state.values["steps"] < stop_at
-    later = {snapshot.step: snapshot.digest() for snapshot in trained(recipe, tmp_path)}
-    assert set(later) == {step for step in straight if step > state.values["steps"]}
-    assert resumed | later == straight
+    assert_resumes(recipe, [2], tmp_path, stop_at=stop_at)
 
 
 @pytest.fixture
@@ -109,23 +66,16 @@ def saved(tmp_path: Path) -> Callable[[], Path]:
     return save
 
 
-def test_a_checkpoint_comes_back(saved: Callable[[], Path]) -> None:
+def test_the_last_checkpoint_comes_back_and_replaces_the_others(saved: Callable[[], Path]) -> None:
     dataset = saved()
+    folder(dataset).save(TrainingState({"steps": 20}, {"weights": np.arange(4.0)}))
     state = folder(dataset).load()
     assert state is not None
-    assert state.values == {"steps": 10}
+    assert state.values == {"steps": 20}
     assert np.array_equal(state.arrays["weights"], np.arange(4.0))
+    assert len(list((dataset / CHECKPOINTS / "task").iterdir())) == 1
     folder(dataset).clear()
     assert folder(dataset).load() is None
-
-
-def test_the_last_one_replaces_the_others(saved: Callable[[], Path]) -> None:
-    dataset = saved()
-    folder(dataset).save(TrainingState({"steps": 20}, {"weights": np.zeros(2)}))
-    state = folder(dataset).load()
-    assert state is not None
-    assert state.values["steps"] == 20
-    assert len(list((dataset / CHECKPOINTS / "task").iterdir())) == 1
 
 
 @pytest.mark.parametrize("change", [{"key": "other recipe"}, {"missing": {2: 10}}])

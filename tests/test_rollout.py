@@ -83,19 +83,14 @@ def test_episodes_end_where_they_end(environment: Environment) -> None:
     assert lanes.stepped == [[0, 1, 2, 3, 4, 5], [1, 2, 3, 4, 5], [2, 3, 4, 5], [3, 4, 5]]
 
 
-def test_the_controller_sees_every_lane_and_actions_are_stored_as_executed(environment: Environment) -> None:
+def test_the_controller_sees_every_lane_and_every_step_as_it_was_executed(environment: Environment) -> None:
     controller = Recording()
     episodes = roll(environment, Falling(), controller)
     assert controller.seen == [6, 6, 6, 6]
-    assert all((episode.actions == 1.0).all() for episode in episodes)
-
-
-def test_the_controller_observes_every_step_as_it_was_executed(environment: Environment) -> None:
-    controller = Recording()
-    roll(environment, Falling(), controller)
+    assert all((episode.actions == 1.0).all() for episode in episodes)  # clipped from 3.0
+    assert all((step.actions == 1.0).all() for step in controller.transitions)
     assert [step.rewards.sum() for step in controller.transitions] == [6.0, 5.0, 4.0, 3.0]
     assert [step.active.sum() for step in controller.transitions] == [6, 5, 4, 3]
-    assert all((step.actions == 1.0).all() for step in controller.transitions)  # clipped from 3.0
     for t, step in enumerate(controller.transitions):
         assert (step.observations == t).all() and (step.next_observations == t + 1).all()
         assert step.terminated.sum() == 1 and not step.rewards[~step.active].any()

@@ -8,7 +8,7 @@ import torch
 from safetensors.numpy import load, save
 from stable_baselines3 import SAC
 
-from tcmrl_data import Dataset, import_sac, load_recipe
+from tcmrl_data import Dataset, load_recipe
 from tcmrl_data.behavior.snapshot import LOG_STD_RANGE, Snapshot, read_snapshot, snapshot_of_sac
 from tcmrl_data.foundation.errors import SnapshotError
 from tcmrl_data.foundation.plain_files import read_plain_file
@@ -119,13 +119,3 @@ def test_stored_snapshots_reproduce_the_stored_actions(tiny: Dataset) -> None:
         seen = np.stack([episode.observations[t] for episode in episodes])
         expected = np.stack([episode.actions[t] for episode in episodes])
         np.testing.assert_allclose(controller.act(seen, noise[:, t]), expected, atol=1e-6)
-
-
-def test_a_policy_with_other_action_bounds_is_not_imported(tmp_path: Path) -> None:
-    """Stable-Baselines3 scales the actor's output to the bounds; those of Pendulum are -2 and 2."""
-    SAC("MlpPolicy", "Pendulum-v1", device="cpu", buffer_size=10).save(tmp_path / "pendulum.zip")
-    with pytest.raises(
-        SnapshotError, match=r"actions lie in \[-2.0, 2.0\], .* in \[-1, 1\]; .*RescaleAction"
-    ):
-        import_sac(tmp_path / "pendulum.zip", tmp_path / "out", observation="stored")
-    assert not (tmp_path / "out").exists()

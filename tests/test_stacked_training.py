@@ -31,6 +31,7 @@ from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.verification.garbage import collect_garbage
 from tcmrl_data.verification.repair import repair_dataset
 from tests.datasets import part_ids
+from tests.training_of_behavior import Interrupted, assert_resumes, context_of
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
@@ -48,34 +49,8 @@ HOPPER = (*TINY, "behavior.stacked.steps=260", "behavior.stacked.snapshots=[0,20
 TASKS = [1, 2, 3, 5]
 
 
-class Interrupted(Exception):
-    """Ends a training in the middle, like a kill."""
-
-
 def recipe_of(name: str = "point-robot-wind", overrides: Sequence[str] = TINY) -> Recipe:
     return load_recipe(name, profile="quick", overrides=overrides, behavior="stacked")
-
-
-def context_of(
-    recipe: Recipe, tasks: Sequence[int], folder: Path, *, seconds: float = np.inf, stop_at: float = np.inf
-) -> BehaviorContext:
-    steps = 0
-
-    def report(count: int) -> None:
-        nonlocal steps
-        steps += count
-        if steps >= stop_at * len(tasks):
-            raise Interrupted
-
-    return BehaviorContext(
-        environment=recipe.make_environment(),
-        tasks=choose_tasks(recipe, tasks),
-        seed=0,
-        observation=recipe.behavior.observation,
-        reward=recipe.behavior.reward,
-        report=report,
-        checkpoints=lambda _: CheckpointFolder(folder, "group", key="k", missing={}, seconds=seconds),
-    )
 
 
 def source_of(recipe: Recipe) -> StackedSource:
@@ -88,10 +63,6 @@ def settings_of(recipe: Recipe) -> StackedSettings:
 
 def snapshots_of(recipe: Recipe, context: BehaviorContext) -> dict[tuple[int, int], Snapshot]:
     return {(task.index, snapshot.step): snapshot for task, snapshot in source_of(recipe).snapshots(context)}
-
-
-def digests(snapshots: dict[tuple[int, int], Snapshot]) -> dict[tuple[int, int], str]:
-    return {key: snapshot.digest() for key, snapshot in snapshots.items()}
 
 
 def test_what_a_task_draws_and_learns_does_not_depend_on_its_group(tmp_path: Path) -> None:
@@ -131,22 +102,7 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
     tmp_path: Path, name: str, overrides: tuple[str, ...], stop_at: int
 ) -> None:
     """Interrupted within an episode; in hopper the lanes are then at different steps and episodes."""
-    recipe, tasks = recipe_of(name, overrides), [0, 2, 3]
-    straight = digests(snapshots_of(recipe, context_of(recipe, tasks, tmp_path / "straight")))
-    resumed: dict[tuple[int, int], str] = {}
-    interrupted = source_of(recipe).snapshots(
-        context_of(recipe, tasks, tmp_path, seconds=0.0, stop_at=stop_at)
-    )
-    with pytest.raises(Interrupted):
-        resumed.update(((task.index, snapshot.step), snapshot.digest()) for task, snapshot in interrupted)
-    context = context_of(recipe, tasks, tmp_path)
-    state = context.checkpoints(context.tasks).load()
-    assert state is not None
-    done = state.values["steps"]
-    assert 0 < done < stop_at
-    later = digests(snapshots_of(recipe, context))
-    assert set(later) == {key for key in straight if key[1] > done}
-    assert resumed | later == straight
+    assert_resumes(recipe_of(name, overrides), [0, 2, 3], tmp_path, stop_at=stop_at)
 
 
 @pytest.fixture(scope="module")

@@ -58,9 +58,11 @@ def test_a_recipe_can_ask_for_a_permutation() -> None:
     assert means == pytest.approx([1.38, 2.11], abs=0.01)
 
 
-def test_strata_need_an_order() -> None:
-    with pytest.raises(RecipeError, match="tasks of point-robot-wind have no order; set it to 'permutation'"):
-        load_recipe("point-robot-wind", overrides=["environment.split=strata"])
+@pytest.mark.parametrize("split", ["strata", "interpolation"])
+def test_a_split_along_the_order_needs_one(split: str) -> None:
+    message = f"'{split}', but the tasks of point-robot-wind have no order; set it to 'permutation'"
+    with pytest.raises(RecipeError, match=message):
+        load_recipe("point-robot-wind", overrides=[f"environment.split={split}"])
 
 
 @given(st.integers(1, 30), st.integers(1, 30), st.integers(0, 2**32))
@@ -77,11 +79,6 @@ def test_interpolation_tests_the_middle_of_every_stratum() -> None:
     assert middles_of_strata([9, 8, 7, 6, 5, 4], 2) == {8, 5}
     assert middles_of_strata([9, 8, 7, 6, 5], 2) == {8, 6}  # of two and of three tasks
     assert middles_of_strata([9, 8, 7], 3) == {9, 8, 7}
-
-
-def test_interpolation_needs_an_order() -> None:
-    with pytest.raises(RecipeError, match="'interpolation', but the tasks of point-robot-wind have no order"):
-        load_recipe("point-robot-wind", overrides=["environment.split=interpolation"])
 
 
 def test_tasks_of_imports_may_lack_what_orders_them() -> None:

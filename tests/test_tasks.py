@@ -38,34 +38,26 @@ def test_the_split_never_moves() -> None:
     assert [task.index for task in tasks if task.split == "test"] == [12, 15, 16, 17, 18, 19, 22, 26, 28, 44]
 
 
-def drawn_elsewhere(names: list[str], variables: dict[str, str]) -> list[Any]:
-    """The tasks of environments, drawn by a process with other instruction sets."""
+@pytest.mark.parametrize("platform", OTHER_PLATFORMS)
+@pytest.mark.parametrize(
+    "names",
+    [
+        pytest.param(NAMES, marks=pytest.mark.check, id="some"),
+        pytest.param(ALL_NAMES, marks=pytest.mark.exhaustive, id="all"),
+    ],
+)
+def test_tasks_are_the_same_bits_on_every_instruction_set(names: list[str], platform: str) -> None:
+    """They are drawn by a process with other instruction sets."""
     done = subprocess.run(
         [sys.executable, "-c", DRAW, *names],
-        env=os.environ | variables,
+        env=os.environ | OTHER_PLATFORMS[platform],
         capture_output=True,
         text=True,
         check=True,
     )
-    return [json.loads(line) for line in done.stdout.splitlines()]
-
-
-def assert_equal_elsewhere(names: list[str], variables: dict[str, str]) -> None:
-    for name, elsewhere in zip(names, drawn_elsewhere(names, variables), strict=True):
+    for name, line in zip(names, done.stdout.splitlines(), strict=True):
         here = [[task.index, task.split, task.parameters] for task in draw_tasks(environment_of(name))]
-        assert elsewhere == here, name
-
-
-@pytest.mark.check
-@pytest.mark.parametrize("platform", OTHER_PLATFORMS)
-def test_tasks_are_the_same_bits_on_every_instruction_set(platform: str) -> None:
-    assert_equal_elsewhere(NAMES, OTHER_PLATFORMS[platform])
-
-
-@pytest.mark.exhaustive
-@pytest.mark.parametrize("platform", OTHER_PLATFORMS)
-def test_all_tasks_are_the_same_bits_on_every_instruction_set(platform: str) -> None:
-    assert_equal_elsewhere(ALL_NAMES, OTHER_PLATFORMS[platform])
+        assert json.loads(line) == here, name
 
 
 def numbers(value: Any) -> Iterator[float]:
