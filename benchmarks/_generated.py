@@ -7,14 +7,14 @@ import numpy as np
 import tcmrl_data
 from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
 from tcmrl_data.building.ledger import Ledger
-from tcmrl_data.building.part import seal_part
 from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.building.published import Published
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
+from tcmrl_data.parts.making import Published, make_part
+from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.keys import PartKey, part_file, part_folder
 from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
@@ -94,13 +94,12 @@ def noise_part(plan: BuildPlan, task: Task, step: int) -> tuple[PartRecord, byte
         name: random.standard_normal(shape, dtype=np.float32) for name, shape in description.shapes().items()
     }
     snapshot = Snapshot(step, description, tensors)
-    return seal_part(
-        plan,
-        task=task,
-        snapshot=snapshot,
-        trajectories=trajectories,
+    return make_part(
+        WantedPart(plan.recipe.unit_settings(), task, step, plan.seed, snapshot),
+        trajectories,
         references=References(uniform=-1.0, oracle=0.0, scripted=None),
         behavior={"generated": "white noise"},
+        platform=plan.platform,
     )
 
 

@@ -12,8 +12,8 @@ from _timing import REPEATS, Measured, median, memory, rounded, seconds
 
 import tcmrl_data
 from tcmrl_data.building.ledger import SEAL_SECONDS, SEAL_SHARE, Ledger
-from tcmrl_data.building.published import Published
 from tcmrl_data.foundation.disk import make_folders
+from tcmrl_data.parts.making import Published
 from tcmrl_data.store.keys import part_file
 
 SNAPSHOTS = 100

@@ -26,9 +26,10 @@ import numpy.typing as npt
 from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.building.part import roll_out_part
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.envs.tasks import Task
+from tcmrl_data.parts.operation import Simulator
+from tcmrl_data.parts.rollouts import act
 from tcmrl_data.recipe.tasks import choose_tasks
 
 CHECKPOINTS = 5
@@ -53,9 +54,9 @@ def curves(recipe: Recipe, tasks: list[Task], seed: int) -> Returns:
     )
     found = defaultdict(list)
     for task, snapshot in plan.source.snapshots(context):
-        lanes = plan.environment.lanes([task.parameters] * recipe.rollouts.lanes)
-        episodes = roll_out_part(plan, task=task, snapshot=snapshot, lanes=lanes)
-        lanes.close()
+        simulator = Simulator(recipe, seed=plan.seed, task=task, environment=plan.environment)
+        episodes = act(snapshot, simulator, parameters=task.parameters)
+        simulator.close()
         found[task.index].append(np.mean([episode.undiscounted_return for episode in episodes]))
     return np.array([found[task.index][1:] for task in tasks])
 

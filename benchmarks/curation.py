@@ -23,9 +23,10 @@ import tcmrl_data
 from tcmrl_data import Dataset, Trajectory, open_dataset
 from tcmrl_data.envs.tasks import draw_tasks
 from tcmrl_data.foundation.disk import write_file
+from tcmrl_data.parts.making import make_part
+from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part_making import make_part
 from tcmrl_data.store.part_record import DATA_VERSION, References
 from tcmrl_data.store.part_table import PartTable, part_entry
 from tcmrl_data.store.platform import UNKNOWN
@@ -50,12 +51,8 @@ def make_dataset(folder: Path, *, tasks: int, rows: int, seed: int) -> Dataset:
                 ended,
             )
             record, data = make_part(
-                settings=recipe.unit_settings(),
-                task=task,
-                step=step,
-                seed=seed,
-                snapshot=None,
-                trajectories=[episode],
+                WantedPart(settings=recipe.unit_settings(), task=task, step=step, seed=seed),
+                [episode],
                 references=References(uniform=0.0, oracle=float(rows), scripted=None),
             )
             file = folder / part_file(PartKey(task.index, step))

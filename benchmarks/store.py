@@ -29,9 +29,9 @@ from _many_parts import measure_many, measure_open
 from _timing import REPEATS, Measured, forget, median, race, rounded, seconds
 
 import tcmrl_data
-from tcmrl_data.building.published import Published
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.foundation.machine import available_cores
+from tcmrl_data.parts.making import Published
 from tcmrl_data.sampling.rows import read_rows
 from tcmrl_data.store.archive import pack_archive
 from tcmrl_data.store.keys import part_file

@@ -12,9 +12,10 @@ from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.envs.base import DENSE_REWARDS
 from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
+from tcmrl_data.parts.making import make_part
+from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part_making import make_part
 from tcmrl_data.store.part_record import DATA_VERSION, References
 from tcmrl_data.store.part_table import PartTable, part_entry
 from tcmrl_data.store.platform import UNKNOWN
@@ -99,12 +100,14 @@ def made_dataset(
     entries = []
     for key, trajectories in parts.items():
         record, data = make_part(
-            settings=recipe.unit_settings(),
-            task=drawn[key.task],
-            step=key.step,
-            seed=seed,
-            snapshot=(snapshots or {}).get(key),
-            trajectories=trajectories,
+            WantedPart(
+                settings=recipe.unit_settings(),
+                task=drawn[key.task],
+                step=key.step,
+                seed=seed,
+                snapshot=(snapshots or {}).get(key),
+            ),
+            trajectories,
             references=references,
         )
         replace_file(folder / part_file(key), data, staging=folder / STAGING)

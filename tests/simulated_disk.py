@@ -14,10 +14,10 @@ import pytest
 import tcmrl_data
 from tcmrl_data import BuildEvent, BuildReport, Dataset, Recipe, TcmrlError
 from tcmrl_data.building import build, ledger
-from tcmrl_data.building.published import read_published
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import STAGING, Disk, replace_file
+from tcmrl_data.parts.making import read_published
 from tcmrl_data.store import tables
 from tcmrl_data.store.keys import PartKey, part_file
 

@@ -18,10 +18,9 @@ from tcmrl_data import (
     verify_dataset,
 )
 from tcmrl_data.building.work_files import ASSEMBLY
-from tcmrl_data.engine.base import Unit
+from tcmrl_data.engine.base import ENGINES, Unit
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import STAGING, remove_abandoned
-from tcmrl_data.operations.remaking import ENGINES
 from tcmrl_data.store import tables
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import MANIFEST

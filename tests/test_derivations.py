@@ -8,8 +8,9 @@ from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, derive_dataset, merge_datasets, open_dataset, split_dataset, verify_dataset
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.parts.making import make_part
+from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.part_making import make_part
 from tcmrl_data.store.part_table import PartTable, part_entry
 from tcmrl_data.store.sealing import write_dataset
 from tests.commands import in_process
@@ -67,14 +68,15 @@ def test_a_forged_part_is_found(seeds: list[Dataset], tmp_path: Path) -> None:
     for episode in episodes:
         episode.rewards[...] += 1
     forged, archive = make_part(
-        settings=record.identity.settings,
-        task=made.task(1),
-        step=300,
-        seed=record.identity.seed,
-        snapshot=None,
-        trajectories=episodes,
+        WantedPart(
+            settings=record.identity.settings,
+            task=made.task(1),
+            step=300,
+            seed=record.identity.seed,
+            derived=record.identity.derived,
+        ),
+        episodes,
         references=record.references,
-        derived=record.identity.derived,
     )
     made.file_of(key).write_bytes(archive)
     entries = [entry for entry in made.parts.entries() if entry.key != key]
@@ -132,14 +134,15 @@ def test_a_part_that_contradicts_its_origin_is_found_without_the_source(
     record = made.part(*key)
     assert record.identity.derived is not None
     forged, archive = make_part(
-        settings=record.identity.settings,
-        task=made.task(0),
-        step=key.step,
-        seed=0,
-        snapshot=None,
-        trajectories=made.trajectories(*key),
+        WantedPart(
+            settings=record.identity.settings,
+            task=made.task(0),
+            step=key.step,
+            seed=0,
+            derived=record.identity.derived | derived,
+        ),
+        made.trajectories(*key),
         references=record.references,
-        derived=record.identity.derived | derived,
     )
     made.file_of(key).write_bytes(archive)
     reseal(

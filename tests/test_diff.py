@@ -15,8 +15,9 @@ from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
+from tcmrl_data.parts.making import make_part
+from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.part_making import make_part
 from tests.commands import assert_refused, in_process
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
@@ -37,12 +38,14 @@ def changed(
     record = tiny.part(*KEY)
     trajectories, snapshot = change(tiny.trajectories(*KEY), tiny.snapshot(*KEY))
     made = make_part(
-        settings=record.identity.settings,
-        task=task or tiny.task(KEY.task),
-        step=KEY.step,
-        seed=seed,
-        snapshot=snapshot,
-        trajectories=trajectories,
+        WantedPart(
+            settings=record.identity.settings,
+            task=task or tiny.task(KEY.task),
+            step=KEY.step,
+            seed=seed,
+            snapshot=snapshot,
+        ),
+        trajectories,
         references=record.references,
         platform=record.platform,
     )

@@ -28,8 +28,9 @@ from tcmrl_data.envs.controller import PlaybackController
 from tcmrl_data.foundation.errors import BuildError, SelectionError, SimulationError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
+from tcmrl_data.parts.making import make_part
+from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.part_making import make_part
 from tests.commands import assert_refused, in_process
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
@@ -163,15 +164,17 @@ def forged(dataset: Dataset, out: Path, change: Callable[[Trajectory], Trajector
                 assembly.copy([Copied(key, dataset, key)])
             else:
                 made = make_part(
-                    settings=identity.settings,
-                    task=dataset.task(key.task),
-                    step=key.step,
-                    seed=identity.seed,
-                    snapshot=dataset.snapshot(*key),
-                    trajectories=[change(episode) for episode in dataset.trajectories(*key)],
+                    WantedPart(
+                        settings=identity.settings,
+                        task=dataset.task(key.task),
+                        step=key.step,
+                        seed=identity.seed,
+                        snapshot=dataset.snapshot(*key),
+                        derived=identity.derived,
+                    ),
+                    [change(episode) for episode in dataset.trajectories(*key)],
                     references=record.references,
                     platform=record.platform,
-                    derived=identity.derived,
                 )
                 assembly.write(key, functools.partial(copy.copy, made))
         manifest = dataset.manifest

@@ -9,11 +9,11 @@ from typing import Any
 from tcmrl_data.building.events import BuildEvent, EventKind, EventLog
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.nodes import check_nodes
-from tcmrl_data.building.published import Published
 from tcmrl_data.building.unit import UnitSpec
 from tcmrl_data.engine.base import BaseEngine, Result, Unit
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.locks import VISIBLE_SECONDS
+from tcmrl_data.parts.making import Published
 from tcmrl_data.store.keys import PartKey, part_file
 
 WORKER = "tcmrl_data.building.worker"

@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.building.published import Published, read_published
 from tcmrl_data.foundation.disk import STAGING, named_errors, replace_file
 from tcmrl_data.foundation.errors import (
     BuildError,
@@ -19,6 +18,7 @@ from tcmrl_data.foundation.errors import (
 from tcmrl_data.foundation.locks import wait_until_visible
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem, status_of
+from tcmrl_data.parts.making import Published, read_published
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_file, part_folder

@@ -15,9 +15,8 @@ from typing import Any
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.building.part import PartMaker
 from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.building.unit import UnitSpec
+from tcmrl_data.building.unit import PartMaker, UnitSpec
 from tcmrl_data.engine.worker import Send, serve
 from tcmrl_data.envs.tasks import Task
 

@@ -1,23 +1,30 @@
-"""What one worker does: train a unit's behavior policies, roll them out, publish the parts. Idempotent."""
+"""What one worker does: train a unit's behavior policies, roll them out, publish the parts. Idempotent.
+
+The process of a unit is `python -m tcmrl_data.building.worker`.
+"""
 
 import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, final
 
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.building.part import PartMaker
+from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.work_files import checkpoint_name
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import canonical_json, digest
+from tcmrl_data.foundation.errors import NondeterminismError
+from tcmrl_data.parts.making import Published, make_part, publish, read_published
+from tcmrl_data.parts.operation import Simulator, Sources, WantedPart
+from tcmrl_data.parts.rollouts import Rollout, measure_references
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.part_record import DATA_VERSION, read_part_record
+from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
+from tcmrl_data.store.part_record import DATA_VERSION, PartRecord, References, read_part_record
 
 
 @dataclass(frozen=True)
@@ -72,6 +79,63 @@ def run_unit(spec: UnitSpec, report: Send) -> str:
         _make_parts(spec, plan, report)
     keys = [PartKey(task.index, step) for task in plan.wanted for step in plan.source.steps]
     return digest([_part_id(spec.dataset / part_file(key)) for key in keys])
+
+
+@final
+class PartMaker:
+    """Rolls out and publishes the snapshots of one task, with one simulator.
+
+    Args:
+        dataset: its folder.
+        plan: of the build.
+        task: whose snapshots these are.
+        behavior: what the behavior source records with its parts.
+    """
+
+    def __init__(self, dataset: Path, plan: BuildPlan, *, task: Task, behavior: Mapping[str, Any]) -> None:
+        self._dataset, self._behavior = dataset, behavior
+        self._simulator = Simulator(
+            plan.recipe, seed=plan.seed, task=task, environment=plan.environment, platform=plan.platform
+        )
+        self._references: References | None = None
+
+    def close(self) -> None:
+        """Frees the simulator; closing twice does no harm."""
+        self._simulator.close()
+
+    def publish(self, snapshot: Snapshot) -> Published | None:
+        """Publishes the part of a snapshot; one that is there already is left alone, and None is returned.
+
+        Raises:
+            NondeterminismError: the part that is there was made on an equal platform from another policy.
+        """
+        simulator = self._simulator
+        key = PartKey(simulator.task.index, snapshot.step)
+        file = self._dataset / part_file(key)
+        if not file.exists():
+            return publish(self._dataset, key, lambda: self._make(snapshot))
+        _, record = read_published(file, MAIN_RUN)
+        same_platform = record.platform.digest() == simulator.platform.digest()
+        if same_platform and record.identity.policy != snapshot.digest():
+            raise NondeterminismError(
+                f"{file}: its policy differs from the one trained now with the same seed"
+            )
+        return None
+
+    def _make(self, snapshot: Snapshot) -> tuple[PartRecord, bytes]:
+        simulator = self._simulator
+        settings = simulator.recipe.unit_settings()
+        wanted = WantedPart(settings, simulator.task, snapshot.step, simulator.seed, snapshot)
+        episodes = Rollout().make(wanted, Sources(simulator))
+        if self._references is None:
+            self._references = measure_references(simulator)
+        return make_part(
+            wanted,
+            episodes,
+            references=self._references,
+            behavior=self._behavior,
+            platform=simulator.platform,
+        )
 
 
 def _part_id(file: Path) -> str:

@@ -17,11 +17,12 @@ from tcmrl_data.interchange.readers.base import READERS, Reader, ReadPart, Say, 
 from tcmrl_data.interchange.readers.source_files import path_digest
 from tcmrl_data.interchange.survey import Survey
 from tcmrl_data.operations.assembly import Assembly, derivation_of, open_assembly
+from tcmrl_data.parts.making import make_part
+from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.recipe import Recipe, bound_recipe, check_licence, foreign_recipe
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.limits import check_plan
 from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part_making import make_part
 from tcmrl_data.store.part_record import DATA_VERSION, PartRecord
 from tcmrl_data.store.task_table import parse_task_file, task_line
 
@@ -280,12 +281,7 @@ def _make_part(plan: _Plan, task: Task, part: ReadPart) -> tuple[PartRecord, byt
         for trajectory in part.trajectories
     ]
     return make_part(
-        settings=plan.recipe.unit_settings(),
-        task=task,
-        step=part.step,
-        seed=None,
-        snapshot=None,
-        trajectories=trajectories,
+        WantedPart(settings=plan.recipe.unit_settings(), task=task, step=part.step), trajectories
     )
 
 

@@ -18,12 +18,13 @@ from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replac
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.interchange.readers.episodes import Cuts, episode
 from tcmrl_data.operations.assembly import derivation_of, open_assembly
+from tcmrl_data.parts.making import make_part
+from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.recipe import bound_recipe, check_licence, foreign_recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_folder
 from tcmrl_data.store.manifest import Manifest, Run
-from tcmrl_data.store.part_making import make_part
 from tcmrl_data.store.part_record import DATA_VERSION, STANDARD_ARRAYS, PartRecord
 
 
@@ -243,12 +244,8 @@ class DatasetRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
 
     def _make(self, trajectories: list[Trajectory]) -> tuple[PartRecord, bytes]:
         return make_part(
-            settings=self._recipe.unit_settings(),
-            task=self._task,
-            step=self._published_steps,
-            seed=None,
-            snapshot=None,
-            trajectories=trajectories,
+            WantedPart(settings=self._recipe.unit_settings(), task=self._task, step=self._published_steps),
+            trajectories,
         )
 
     def _file(self, number: int) -> Path:

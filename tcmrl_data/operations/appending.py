@@ -2,10 +2,10 @@
 
 from collections.abc import Sequence
 
-from tcmrl_data.building.published import Published, numbered
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import BuildError, StoreError
+from tcmrl_data.parts.making import Published, numbered
 from tcmrl_data.store.limits import MAX_PARTS, MAX_PLATFORMS, MAX_RUNS
 from tcmrl_data.store.manifest import MANIFEST, Manifest, Run, read_manifest, seal
 from tcmrl_data.store.part_table import PARTS_TABLE, part_line

@@ -7,7 +7,6 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.building.published import Published, read_published
 from tcmrl_data.building.work_files import ASSEMBLY, check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.tasks import Split, Task
@@ -22,9 +21,10 @@ from tcmrl_data.foundation.disk import (
     replace_file,
     sync_files,
 )
-from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.foundation.records import write_ranges
+from tcmrl_data.parts.making import Published, publish
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.limits import MAX_PARTS
@@ -120,7 +120,7 @@ class Assembly:
         self,
         parts: Sequence[Copied],
         *,
-        progress: Callable[[int, int], None] = lambda done, total: None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> None:
         """Copies parts; each is hashed on the way.
 
@@ -136,7 +136,8 @@ class Assembly:
         for done, part in enumerate(parts, start=1):
             entry = self._copy(part)
             self._add(entry, part.source.manifest.platforms[entry.platform])
-            progress(done, len(parts))
+            if progress is not None:
+                progress(done, len(parts))
         self._copied += [self._out / part_file(part.key) for part in parts]
 
     def write(self, key: PartKey, make: Callable[[], tuple[PartRecord, bytes]]) -> PartEntry:
@@ -146,16 +147,7 @@ class Assembly:
             key: the part's.
             make: makes the part's record and archive.
         """
-        file = self._out / part_file(key)
-        published: Published | None = None
-        if self.holds(key):
-            with contextlib.suppress(StoreError, ManifestError):  # a damaged part is made again
-                published, _ = read_published(file, key.run)
-        if published is None:
-            record, data = make()
-            replace_file(file, data, staging=self._out / STAGING)
-            published = Published.of_record(record, run=key.run, archive=data)
-        return self.take(published)
+        return self.take(publish(self._out, key, make))
 
     def take(self, published: Published) -> PartEntry:
         """Adds a part that another process has published in the folder."""

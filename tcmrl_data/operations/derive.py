@@ -9,7 +9,7 @@ from tcmrl_data.dataset.tiers import MEDIUM_SCORE, medium_scores
 from tcmrl_data.envs.tasks import Split
 from tcmrl_data.foundation.errors import SelectionError, TierError
 from tcmrl_data.operations.assembly import check_out
-from tcmrl_data.operations.plan import Plan, Progress, carry_out, no_progress
+from tcmrl_data.operations.plan import Plan, Progress, carry_out
 from tcmrl_data.operations.rename import check_label
 from tcmrl_data.operations.subset import Choice, plan_subset
 from tcmrl_data.operations.view_file import write_view
@@ -66,7 +66,7 @@ def derive_dataset(
     tolerance: float = TOLERANCE,
     strict: bool = False,
     dry_run: bool = False,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
 ) -> Derived:
     """Makes a dataset, or a view, of some parts and episodes of another.
 

@@ -6,17 +6,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.building.published import Published
 from tcmrl_data.building.work_files import check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.disk import LOCK, lock_file, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, StoreError
 from tcmrl_data.operations.appending import append_parts
 from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
-from tcmrl_data.operations.extension import EXTEND, MAX_NOISE
 from tcmrl_data.operations.pairs import nearest_pairs, runs_of_pairs
-from tcmrl_data.operations.remaking import Job, RemakeSpec, remake_parts
 from tcmrl_data.operations.stored import check_parts, keys_of_run, simulated_run
+from tcmrl_data.parts.making import Published
+from tcmrl_data.parts.rollouts import EXTEND, MAX_NOISE
+from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
 from tcmrl_data.recipe.recipe import Rollouts
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.manifest import Run, read_manifest
@@ -58,7 +58,7 @@ def extend_dataset(
     allow_drift: bool = False,
     workers: int | None = None,
     dry_run: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> ExtendReport:
     """Lets the policies of stored parts act again, with the next of their keyed seeds.
 
@@ -112,7 +112,7 @@ def extend_dataset(
     spec = extension.spec(target, new)
 
     def remake() -> list[Published]:
-        return remake_parts(spec, workers=workers, progress=progress)
+        return derive_parts(spec, workers=workers, progress=progress)
 
     if out is None:
         root = _in_place(dataset, runs, remake)
@@ -206,11 +206,11 @@ class _Extension:
             runs[name] = new
         return list(runs.values())
 
-    def spec(self, out: Path, jobs: Sequence[Job]) -> RemakeSpec:
+    def spec(self, out: Path, jobs: Sequence[Job]) -> DeriveSpec:
         """What the workers are told."""
         settings = {name: self.settings[name] for name in ("first_episode", "noise")}
         source = self._dataset.path.resolve()
-        return RemakeSpec(source, out.resolve(), EXTEND, settings, self._recipe, self._seed, tuple(jobs))
+        return DeriveSpec(source, out.resolve(), EXTEND, settings, self._recipe, self._seed, tuple(jobs))
 
 
 def _in_place(dataset: Dataset, runs: Sequence[Run], remake: Callable[[], list[Published]]) -> str:

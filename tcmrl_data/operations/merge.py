@@ -8,7 +8,7 @@ from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.operations.assembly import check_out
 from tcmrl_data.operations.derive import Derived, summary
 from tcmrl_data.operations.merging import plan_merge
-from tcmrl_data.operations.plan import Progress, carry_out, no_progress
+from tcmrl_data.operations.plan import Progress, carry_out
 from tcmrl_data.operations.rename import check_label
 
 
@@ -20,7 +20,7 @@ def merge_datasets(
     split_from: str | Path | Dataset | None = None,
     label: str | None = None,
     dry_run: bool = False,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
 ) -> Derived:
     """Makes the union of datasets; parts keep ids and bytes, and their order does not matter.
 

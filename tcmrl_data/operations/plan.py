@@ -3,24 +3,19 @@
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.operations.assembly import Copied, open_assembly
-from tcmrl_data.operations.cutting import Cut, cut_part
+from tcmrl_data.parts.making import make_from
+from tcmrl_data.parts.operation import Operation, StoredPart, can_be_made_again
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import Derivation, Manifest, Run
 from tcmrl_data.store.part_record import PartRecord
 
-SIMULATED_KINDS = ("built", "extended", "relabelled")
-"""Kinds of runs whose parts can be made again by the simulator, unless they are cut."""
-
 Progress = Callable[[int, int], None]
 """Called with parts done and parts in all."""
-
-
-def no_progress(done: int, total: int) -> None:
-    """Shows nothing."""
 
 
 @dataclass(frozen=True)
@@ -31,13 +26,24 @@ class PlannedPart:
         key: in the new dataset.
         source: where it comes from.
         source_key: in the source.
-        cut: what is kept of it; None takes the part over as it is.
+        operation: makes the part of the other, without a simulator; None takes the part over as it is.
     """
 
     key: PartKey
     source: Dataset
     source_key: PartKey
-    cut: Cut | None = None
+    operation: Operation[Any] | None = None
+
+    def make(self) -> tuple[PartRecord, bytes]:
+        """The record and the archive of a part that is made anew.
+
+        Raises:
+            StoreError: the part of the source is damaged.
+            SelectionError: it has no such array, or no such episode.
+        """
+        assert self.operation is not None
+        source = StoredPart.of(self.source, self.source_key)
+        return make_from(self.operation, source, task=self.source.task(self.source_key.task))
 
 
 @dataclass(frozen=True)
@@ -67,7 +73,7 @@ class Plan:
     @property
     def num_cut(self) -> int:
         """Number of parts that are made anew."""
-        return sum(part.cut is not None for part in self.parts)
+        return sum(part.operation is not None for part in self.parts)
 
     @property
     def bytes(self) -> int:
@@ -75,7 +81,7 @@ class Plan:
         return sum(part.source.entry(part.source_key).size for part in self.parts)
 
 
-def carry_out(plan: Plan, out: Path, progress: Progress = no_progress) -> Manifest:
+def carry_out(plan: Plan, out: Path, progress: Progress | None = None) -> Manifest:
     """Makes a planned dataset, or finishes one whose making was stopped.
 
     Raises:
@@ -83,18 +89,19 @@ def carry_out(plan: Plan, out: Path, progress: Progress = no_progress) -> Manife
         StorageError: the operating system refuses an operation.
         LockedError: another process writes to the folder.
     """
-    whole = [part for part in plan.parts if part.cut is None]
+    whole = [part for part in plan.parts if part.operation is None]
     with open_assembly(out, plan.derivation, plan.sources) as assembly:
         assembly.copy(
             [Copied(part.key, part.source, part.source_key) for part in whole],
-            progress=lambda done, total: progress(done, len(plan.parts)),
+            progress=None if progress is None else lambda done, _: progress(done, len(plan.parts)),
         )
         made = 0
         for part in plan.parts:
-            if part.cut is not None:
+            if part.operation is not None:
                 made += 1
-                assembly.write(part.key, _maker(part, part.cut))
-                progress(len(whole) + made, len(plan.parts))
+                assembly.write(part.key, part.make)
+                if progress is not None:
+                    progress(len(whole) + made, len(plan.parts))
         return assembly.finish(
             name=plan.name,
             data_version=plan.data_version,
@@ -131,12 +138,8 @@ def settle_runs(
         run.model_copy(
             update={
                 "steps": run.steps if has_all else None,
-                "kind": "subset" if run.name in cut and run.kind in SIMULATED_KINDS else run.kind,
+                "kind": "subset" if run.name in cut and can_be_made_again(run) else run.kind,
             }
         )
         for run in sorted(kept, key=lambda run: run.recipe is None)
     )
-
-
-def _maker(part: PlannedPart, cut: Cut) -> Callable[[], tuple[PartRecord, bytes]]:
-    return lambda: cut_part(part.source, part.source_key, cut)

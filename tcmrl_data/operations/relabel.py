@@ -11,9 +11,12 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError, SelectionError
 from tcmrl_data.operations.assembly import check_out, derivation_of, open_assembly
 from tcmrl_data.operations.pairs import Pair, nearest_pairs, runs_of_pairs
-from tcmrl_data.operations.relabelling import RELABEL, Relabelling, relabelled_episodes
-from tcmrl_data.operations.remaking import Job, RemakeSpec, remake_parts
-from tcmrl_data.operations.stored import check_parts, first_episode_of, keys_of_run, simulated_run
+from tcmrl_data.operations.stored import check_parts, keys_of_run, simulated_run
+from tcmrl_data.parts.making import wanted_from
+from tcmrl_data.parts.operation import Simulator, Sources, StoredPart
+from tcmrl_data.parts.playback import RELABEL
+from tcmrl_data.parts.stored import first_episode_of
+from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.limits import MAX_RUNS
 from tcmrl_data.store.manifest import Run
@@ -53,7 +56,7 @@ def relabel_dataset(
     label: str | None = None,
     workers: int | None = None,
     dry_run: bool = False,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> RelabelReport:
     """Makes a dataset of stored episodes with the rewards that other tasks give for them.
 
@@ -129,8 +132,8 @@ def relabel_dataset(
     }
     derivation = derivation_of(RELABEL, settings, [dataset])
     check_out(out, derivation)
-    first_episode = first_episode_of(source_run.origin)
-    spec = RemakeSpec(
+    first_episode = first_episode_of(source_run)
+    spec = DeriveSpec(
         dataset.path.resolve(),
         out.resolve(),
         RELABEL,
@@ -146,7 +149,7 @@ def relabel_dataset(
         return RelabelReport(out, *counts, None)
     targets = {job.key.task for job in jobs}
     with open_assembly(out, derivation, [dataset]) as assembly:
-        for published in remake_parts(spec, workers=workers, progress=progress):
+        for published in derive_parts(spec, workers=workers, progress=progress):
             assembly.take(published)
         manifest = assembly.finish(
             name=dataset.name,
@@ -204,23 +207,20 @@ def _refuse_test(tasks: Sequence[Task], allow_test: bool) -> None:
         )
 
 
-def _try_out(dataset: Dataset, spec: RemakeSpec) -> None:
+def _try_out(dataset: Dataset, spec: DeriveSpec) -> None:
     """Relabels the first episode that goes to every task, so that most refusals come before any work.
 
     Raises:
         SimulationError: tasks differ in more than rewards.
     """
-    environment = dataset.environment
     firsts = {job.key.task: job for job in reversed(spec.jobs)}
     for index, job in sorted(firsts.items()):
-        target = dataset.task(index)
-        with contextlib.closing(environment.lanes([target.parameters])) as lanes:
-            relabelled_episodes(
-                environment,
-                dataset.trajectories(*job.source)[:1],
-                settings=Relabelling(task=job.source.task, **spec.settings),
-                step=job.source.step,
-                seed=spec.seed,
-                target=target,
-                lanes=lanes,
-            )
+        assert spec.seed is not None
+        task, source = dataset.task(index), StoredPart.of(dataset, job.source)
+        simulator = Simulator(
+            spec.recipe, seed=spec.seed, task=task, environment=dataset.environment, num_lanes=1
+        )
+        operation = spec.operation_on(dataset, job.source)
+        wanted = wanted_from(operation, source, task=task, simulator=simulator)
+        with contextlib.closing(simulator):
+            operation.episodes(wanted, Sources(simulator, (source.head(1),)))

@@ -9,10 +9,10 @@ from tcmrl_data.envs.tasks import Split, in_order
 from tcmrl_data.foundation.errors import ManifestError, SelectionError
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
 from tcmrl_data.operations.assembly import check_out, derivation_of
-from tcmrl_data.operations.cutting import Cut
 from tcmrl_data.operations.derive import Derived, summary
-from tcmrl_data.operations.plan import Plan, PlannedPart, Progress, carry_out, no_progress, settle_runs
+from tcmrl_data.operations.plan import Plan, PlannedPart, Progress, carry_out, settle_runs
 from tcmrl_data.operations.view_file import write_view
+from tcmrl_data.parts.stored import Cut
 from tcmrl_data.store.manifest import read_manifest
 
 FOLD, EPISODES = "fold", "episodes"
@@ -28,7 +28,7 @@ def split_dataset(
     names: Sequence[str] | None = None,
     views: bool = False,
     dry_run: bool = False,
-    progress: Progress = no_progress,
+    progress: Progress | None = None,
 ) -> list[Derived]:
     """Makes several datasets of one: task folds, or disjoint episodes of every part.
 
@@ -148,9 +148,9 @@ def plan_episodes(source: Dataset, *, first: int, number: int) -> Plan:
             raise SelectionError(
                 f"{source.path}: {entry.key} has {entry.episodes} episodes, not {first + number}"
             )
-        cut = None if number == entry.episodes else Cut(tuple(range(first, first + number)))
+        cut = None if number == entry.episodes else Cut.of(range(first, first + number))
         parts.append(PlannedPart(entry.key, source, entry.key, cut))
-    keys, cut_runs = [part.key for part in parts], {part.key.run for part in parts if part.cut}
+    keys, cut_runs = [part.key for part in parts], {part.key.run for part in parts if part.operation}
     return Plan(
         name=source.name,
         data_version=source.manifest.data_version,
@@ -169,8 +169,8 @@ def _plan_episodes(source: Dataset, numbers: tuple[int, ...]) -> Iterator[Plan]:
         yield plan_episodes(source, first=sum(numbers[:place]), number=number)
 
 
-def _shifted(progress: Progress, before: int, total: int) -> Progress:
-    return lambda done, _: progress(before + done, total)
+def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
+    return None if progress is None else lambda done, _: progress(before + done, total)
 
 
 def _is_name(name: str) -> bool:

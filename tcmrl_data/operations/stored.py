@@ -1,10 +1,10 @@
 """Stored parts that the simulator can make again, and what has to hold for it."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.errors import BuildError, NondeterminismError, SelectionError
+from tcmrl_data.parts.making import operation_of_run
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import Run
@@ -22,7 +22,7 @@ def simulated_run(dataset: Dataset, name: str) -> tuple[Run, Recipe, int]:
     if name not in known:
         raise SelectionError(f"{dataset.path} has no run {name!r}; it has {', '.join(sorted(known))}")
     run = known[name]
-    if run.recipe is None or run.seed is None or run.kind not in ("built", "extended"):
+    if run.recipe is None or run.seed is None or not operation_of_run(run).own_seeds:
         raise BuildError(
             f"{dataset.path}: run {name} is {run.kind}, so the seeds of its episodes are not known; "
             "name one that was built"
@@ -76,8 +76,3 @@ def keys_of_run(dataset: Dataset, run: str, tasks: Sequence[int] | None, snapsho
     if not keys:
         raise SelectionError(f"{dataset.path}: the selection holds no part of run {run}; choose others")
     return keys
-
-
-def first_episode_of(origin: dict[str, Any] | None) -> int:
-    """Number of the first episode of a run's parts: 0, but for extended ones."""
-    return int((origin or {}).get("first_episode", 0))

@@ -14,8 +14,8 @@ from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator
 from tcmrl_data.operations.assembly import derivation_of
-from tcmrl_data.operations.cutting import SUBSET, Cut
 from tcmrl_data.operations.plan import Plan, PlannedPart, settle_runs
+from tcmrl_data.parts.stored import SUBSET, Cut
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_record import STANDARD_ARRAYS
 
@@ -97,9 +97,9 @@ def plan_subset(source: Dataset, choice: Choice, *, label: str | None = None) ->
     parts: list[PlannedPart] = []
     for task in tasks:
         kept = [
-            PlannedPart(key, source, key, None if cut == Cut() else cut)
+            PlannedPart(key, source, key, _cut(positions, source.entry(key).episodes, choice))
             for key in selection.parts[task.index]
-            if (cut := _cut(source, key, choice)) is not None
+            if (positions := _positions(source, key, choice))
         ]
         if not kept:
             raise SelectionError(
@@ -108,7 +108,7 @@ def plan_subset(source: Dataset, choice: Choice, *, label: str | None = None) ->
             )
         parts += kept
     _check_arrays(source, parts, choice.drop_arrays)
-    cut_runs = {part.key.run for part in parts if part.cut}
+    cut_runs = {part.key.run for part in parts if part.operation}
     settings = choice.to_json() | _scores(source, choice.snapshots, [task.index for task in tasks])
     return Plan(
         name=source.name,
@@ -136,8 +136,15 @@ def _with_held_out(source: Dataset, tasks: Sequence[Task], held_out: Sequence[in
     return tuple(replace(task, split="test" if task.index in held_out else "train") for task in tasks)
 
 
-def _cut(source: Dataset, key: PartKey, choice: Choice) -> Cut | None:
-    """What a choice keeps of a part; None if nothing."""
+def _cut(positions: Sequence[int], present: int, choice: Choice) -> Cut | None:
+    """The operation that keeps some episodes and arrays; None where all are kept."""
+    if len(positions) == present and not choice.drop_arrays:
+        return None
+    return Cut.of(None if len(positions) == present else positions, without=set(choice.drop_arrays))
+
+
+def _positions(source: Dataset, key: PartKey, choice: Choice) -> Sequence[int]:
+    """The episodes that a choice keeps of a part."""
     entry = source.entry(key)
     positions: Sequence[int] = range(entry.episodes)
     if choice.min_return is not None and entry.min < choice.min_return:
@@ -149,14 +156,13 @@ def _cut(source: Dataset, key: PartKey, choice: Choice) -> Cut | None:
                 if episode.undiscounted_return >= choice.min_return
             ]
         if not positions:
-            return None
+            return positions
     number = _number(choice.episodes, entry.episodes, f"{source.path}: {key}")
     if number is not None and number < len(positions):
         positions = (
             positions[:number] if choice.seed is None else _draw(source, key, positions, number, choice.seed)
         )
-    all_kept = len(positions) == entry.episodes
-    return Cut(None if all_kept else tuple(positions), tuple(sorted(set(choice.drop_arrays))))
+    return positions
 
 
 def _draw(source: Dataset, key: PartKey, positions: Sequence[int], number: int, seed: int) -> list[int]:

@@ -14,11 +14,11 @@ from tcmrl_data.envs.tasks import Split, Task, in_order
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
+from tcmrl_data.parts.worker import one_thread
 from tcmrl_data.quality.records import Transfer, TransferTask, heading
 from tcmrl_data.quality.scores import SPLITS
 from tcmrl_data.quality.steps import Progress, spread_tasks
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
-from tcmrl_data.verification.replay import one_thread
 
 EPISODES = 5
 """Episodes of a policy in a task by default."""

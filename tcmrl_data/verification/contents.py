@@ -15,13 +15,13 @@ from tcmrl_data.envs.tasks import Split, Task, draw_tasks
 from tcmrl_data.foundation.errors import SnapshotError, StoreError, TcmrlError, TrajectoryError
 from tcmrl_data.foundation.plain_files import words_after
 from tcmrl_data.foundation.records import first_problem
+from tcmrl_data.parts.making import statistics
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import array_digests, read_arrays, unpack
 from tcmrl_data.store.limits import MAX_TASKS
 from tcmrl_data.store.part_files import POLICY
 from tcmrl_data.store.part_record import RECORD, STANDARD_ARRAYS, PartRecord
-from tcmrl_data.store.statistics import statistics
 from tcmrl_data.verification.derivations import origin_problem
 
 ContentProblem = tuple[str, str]

@@ -7,11 +7,11 @@ from typing import Any
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.errors import SelectionError, TcmrlError
 from tcmrl_data.foundation.plain_files import one_line
-from tcmrl_data.operations.cutting import SUBSET, cut_part, read_cut
 from tcmrl_data.operations.merging import MERGE, plan_merge
 from tcmrl_data.operations.plan import Plan, PlannedPart
 from tcmrl_data.operations.split import EPISODES, FOLD, plan_episodes, plan_fold
 from tcmrl_data.operations.subset import Choice, plan_subset
+from tcmrl_data.parts.stored import SUBSET, read_cut
 from tcmrl_data.store.keys import part_file
 from tcmrl_data.store.manifest import MANIFEST, Derivation
 from tcmrl_data.store.part_record import PartRecord
@@ -87,9 +87,7 @@ def _plan_problems(dataset: Dataset, plan: Plan) -> Iterator[tuple[str, str]]:
 
 
 def _id_of(part: PlannedPart) -> str:
-    if part.cut is None:
-        return part.source.entry(part.source_key).id
-    return cut_part(part.source, part.source_key, part.cut)[0].id
+    return part.source.entry(part.source_key).id if part.operation is None else part.make()[0].id
 
 
 def _subset(sources: Sequence[Dataset], settings: dict[str, Any]) -> Plan:

@@ -9,8 +9,8 @@ from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.foundation.errors import BuildError, StoreError
 from tcmrl_data.foundation.plain_files import read_plain_file
-from tcmrl_data.operations.extension import EXTEND
-from tcmrl_data.operations.remaking import Job, RemakeSpec, remake_parts
+from tcmrl_data.parts.rollouts import EXTEND
+from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import Run
@@ -95,11 +95,11 @@ def extend_again(
     of = origin.get("of", MAIN_RUN)
     jobs = tuple(Job(PartKey(run.source_of(key.task), key.step, of), key) for key in keys)
     make_folders(target / STAGING)
-    spec = RemakeSpec(
+    spec = DeriveSpec(
         dataset.folder.resolve(), target.resolve(), EXTEND, settings, run.recipe, run.seed, jobs
     )
     try:
-        remake_parts(spec, workers=workers, progress=lambda done, total: None)
+        derive_parts(spec, workers=workers)
     except (BuildError, StoreError) as error:
         return (str(error),)
     return ()

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_data.building.events import BuildEvent
-from tcmrl_data.building.published import Published, numbered, read_published
 from tcmrl_data.building.work_files import check_work_files
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import (
@@ -21,6 +20,7 @@ from tcmrl_data.foundation.disk import (
 )
 from tcmrl_data.foundation.errors import NondeterminismError, ReadOnlyError
 from tcmrl_data.foundation.plain_files import folder_problem
+from tcmrl_data.parts.making import Published, numbered, read_published
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import dataset_folder, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable

@@ -1,28 +1,27 @@
-"""Replays: rolls parts out again from their snapshots and seeds, and compares them with the stored arrays."""
+"""Replays: makes parts again by their operations, and compares them with the stored arrays."""
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from tcmrl_data.behavior.snapshot import read_snapshot
-from tcmrl_data.building.part import roll_out_part
-from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.foundation.errors import TcmrlError
-from tcmrl_data.operations.derived import read_settings
-from tcmrl_data.operations.extension import EXTEND, Extension, extended_episodes
-from tcmrl_data.operations.relabelling import RELABEL, Relabelling, relabelled_episodes
+from tcmrl_data.foundation.errors import ManifestError, SnapshotError, StoreError, TcmrlError
+from tcmrl_data.parts.making import operation_of
+from tcmrl_data.parts.operation import Simulator, Sources, StoredPart, WantedPart, can_be_made_again
+from tcmrl_data.parts.worker import one_thread
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.arrays import pack, read_arrays, unpack
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.arrays import pack, read_arrays
+from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.layout import DECODED_FLOOR, DECODED_RATIO
-from tcmrl_data.store.part_record import PartRecord
+from tcmrl_data.store.manifest import Run
+from tcmrl_data.store.part_record import PartRecord, read_part_record
+from tcmrl_data.store.part_table import PartTable
 
 FIRST_STEPS = 5
 STEP_TOLERANCE = 1e-3
@@ -60,31 +59,119 @@ def spread_parts(keys: Sequence[PartKey], number: int) -> list[PartKey]:
     return [keys[position] for position in positions]
 
 
-def replay_part(archive: Archive, record: PartRecord, key: PartKey, recipe: Recipe) -> Replay:
-    """Rolls a part out again, whole lane batches, and compares.
+def replay_part(
+    archive: Archive,
+    record: PartRecord,
+    key: PartKey,
+    recipe: Recipe,
+    files: Mapping[str, Path] | None = None,
+) -> Replay:
+    """Makes a part again by its operation and compares.
 
     Args:
         archive: the part.
         record: its record.
         key: the part's.
-        recipe: what it was built from.
+        recipe: that it goes by.
+        files: of the parts that it may name as its sources, by their ids.
     """
-    identity = record.identity
+    identity, place = record.identity, str(archive.path)
     differences: tuple[str, ...] = ()
     try:
-        if identity.seed is None or identity.policy is None:
-            raise ValueError("its seed or its policy is not known")
-        _check_cost(archive, record, recipe)
-        task = Task(identity.task, "train", identity.parameters)  # the split has no part in rollouts
-        plan = BuildPlan.of_tasks(recipe, seed=identity.seed, tasks=[task])
-        differences = tuple(plan.platform.differences(record.platform))
-        made = _make_again(archive, record, plan)
-        stored = read_arrays(archive, identity.arrays)
+        stored = StoredPart.in_archive(archive, record)
+        operation = operation_of(identity, place)
+        with contextlib.ExitStack() as stack:
+            simulator = None
+            if operation.simulates:
+                _check_cost(archive, record, recipe)
+                assert identity.seed is not None
+                simulator = Simulator(recipe, seed=identity.seed, task=stored.task)
+                stack.callback(simulator.close)
+                differences = tuple(simulator.platform.differences(record.platform))
+            stack.enter_context(one_thread())
+            sources = list(_open_sources(stack, record, files or {}).values())
+            if not sources and {"observations", "actions"} <= {*operation.keeps}:
+                sources = [stored]
+            wanted = WantedPart(
+                identity.settings,
+                stored.task,
+                identity.step,
+                identity.seed,
+                stored.snapshot,
+                identity.derived,
+                identity.data_version,
+            )
+            made = pack(operation.make(wanted, Sources(simulator, sources)))
         compare = _drift_problems if differences else _bit_problems
-        problems = tuple(compare(stored, made))
+        problems = tuple(compare(read_arrays(archive, identity.arrays), made))
     except (TcmrlError, ValidationError, KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
         problems = (f"cannot be made again ({' '.join(str(error).split())[:200]})",)
     return Replay(key.task, key.step, key.run, differences, problems)
+
+
+def derived_problems(
+    folder: Path, table: PartTable, runs: Mapping[str, Run], *, bad: Collection[str]
+) -> Iterator[tuple[str, str]]:
+    """Makes the parts that were made from others again, and yields files and how they differ: forged ones do.
+
+    Parts of another platform are left out, since they come out with other bits here.
+
+    Args:
+        folder: the dataset.
+        table: its parts.
+        runs: its runs by name.
+        bad: files of parts that are known not to hold.
+    """
+    chosen = {name for name, run in runs.items() if run.kind != "built" and can_be_made_again(run)}
+    if not chosen:
+        return
+    keys = {entry.id: entry.key for entry in table.entries()}
+    files = files_of_parts(folder, table, bad=bad)
+    for entry in table.entries():
+        file, recipe = part_file(entry.key), runs[entry.run].recipe if entry.run in chosen else None
+        if recipe is None or file in bad:
+            continue
+        with contextlib.ExitStack() as stack:
+            archive = stack.enter_context(Archive(folder / file))
+            record = read_part_record(archive)
+            replay = replay_part(archive, record, entry.key, recipe, files)
+            for problem in replay.problems if replay.exact else ():
+                yield file, f"made again: {problem}"
+            for part_id, source in _open_sources(stack, record, files).items():
+                for what in _contradictions(record, source.record):
+                    yield file, f"{what} the part of {keys[part_id]}, which it names as its source"
+
+
+def files_of_parts(folder: Path, table: PartTable, *, bad: Collection[str]) -> dict[str, Path]:
+    """The files of a dataset's sound parts by their ids."""
+    files = {entry.id: part_file(entry.key) for entry in table.entries()}
+    return {part_id: folder / file for part_id, file in files.items() if file not in bad}
+
+
+def _open_sources(
+    stack: contextlib.ExitStack, record: PartRecord, files: Mapping[str, Path]
+) -> dict[str, StoredPart]:
+    """The parts that a part names as its sources, those that are at hand."""
+    named = (record.identity.derived or {}).get("from")
+    found = {}
+    for part_id in named if isinstance(named, list) else ():
+        if isinstance(part_id, str) and part_id in files:
+            with contextlib.suppress(StoreError, ManifestError, SnapshotError):  # a finding of its own
+                archive = stack.enter_context(Archive(files[part_id]))
+                found[part_id] = StoredPart.in_archive(archive, read_part_record(archive))
+    return found
+
+
+def _contradictions(record: PartRecord, source: PartRecord) -> Iterator[str]:
+    """How a part contradicts the one that it was made from."""
+    if record.identity.policy != source.identity.policy:
+        yield "its policy is not that of"
+    try:
+        keeps = operation_of(record.identity, "").keeps
+    except TcmrlError:
+        return
+    if any(record.identity.arrays[name] != source.identity.arrays[name] for name in keeps):
+        yield "its episodes are not those of"
 
 
 def _check_cost(archive: Archive, record: PartRecord, recipe: Recipe) -> None:
@@ -97,46 +184,6 @@ def _check_cost(archive: Archive, record: PartRecord, recipe: Recipe) -> None:
     columns = shapes["observations"].shape[1] + shapes["actions"].shape[1] + 2
     if lanes * (horizon + 1) * columns * 4 > max(DECODED_FLOOR, DECODED_RATIO * archive.size):
         raise ValueError(f"{lanes} lanes of {horizon} steps are more than the part's size justifies")
-
-
-def _make_again(archive: Archive, record: PartRecord, plan: BuildPlan) -> dict[str, npt.NDArray[Any]]:
-    (task,) = plan.tasks
-    derived, place = record.identity.derived, str(archive.path)
-    parameters = [task.parameters] * plan.recipe.rollouts.lanes
-    with one_thread(), contextlib.closing(plan.environment.lanes(parameters)) as lanes:
-        if derived is not None and derived.get("operation") == RELABEL:
-            settings = read_settings(Relabelling, derived, place)
-            return pack(
-                relabelled_episodes(
-                    plan.environment,
-                    unpack(read_arrays(archive, record.identity.arrays)),
-                    settings=settings,
-                    step=record.identity.step,
-                    seed=plan.seed,
-                    target=task,
-                    lanes=lanes,
-                )
-            )
-        snapshot = read_snapshot(archive.read, record.identity.step, place=place)
-        if derived is None:
-            return pack(roll_out_part(plan, task=task, snapshot=snapshot, lanes=lanes))
-        if derived.get("operation") == EXTEND:
-            extension = read_settings(Extension, derived, place)
-            return pack(extended_episodes(plan, snapshot, extension, lanes))
-    raise ValueError(f"it is the result of {str(derived.get('operation'))[:40]!r}, not of rollouts")
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """One torch thread, as in a worker: reductions split by thread round differently."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 def _bit_problems(

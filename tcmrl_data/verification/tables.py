@@ -6,10 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from tcmrl_data.building.published import Published, numbered, read_published
 from tcmrl_data.envs.tasks import Task, draw_tasks
 from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
+from tcmrl_data.parts.making import Published, numbered, read_published
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.keys import PartKey, key_of_file, part_file
 from tcmrl_data.store.manifest import MANIFEST, Manifest

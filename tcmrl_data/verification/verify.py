@@ -2,7 +2,7 @@
 
 `quick` checks names, sizes and kinds of files; `digests` also hashes every archive and checks its directory
 and its record; `deep` also decodes every array, checks its content (`contents.py`), and makes extended and
-relabelled parts again on an equal platform (`redoing.py`); `replay.py` rolls parts out again. Beside a
+other derived parts again on an equal platform; `replay.py` makes any part again. Beside a
 running build, a verification checks what the manifest named when it began.
 """
 
@@ -19,9 +19,10 @@ from tcmrl_data.foundation.disk import LOCK, lock_holder
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, words_after
+from tcmrl_data.parts.operation import can_be_made_again
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PARTS, key_of_file, part_file
-from tcmrl_data.store.manifest import FOREIGN_KINDS, MANIFEST, Manifest, dataset_folder, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, Manifest, dataset_folder, read_manifest
 from tcmrl_data.store.part_record import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry
 from tcmrl_data.store.task_table import TASKS
@@ -30,8 +31,13 @@ from tcmrl_data.verification.derivations import derivation_problems
 from tcmrl_data.verification.description import Description
 from tcmrl_data.verification.findings import Finding, VerifyLevel, finding
 from tcmrl_data.verification.part_checks import PartChecks
-from tcmrl_data.verification.redoing import derived_problems
-from tcmrl_data.verification.replay import Replay, replay_part, spread_parts
+from tcmrl_data.verification.replay import (
+    Replay,
+    derived_problems,
+    files_of_parts,
+    replay_part,
+    spread_parts,
+)
 from tcmrl_data.verification.scan import scan_dataset
 
 
@@ -165,18 +171,16 @@ class _Verification:
         """Makes parts again and compares; parts with findings are left out."""
         runs = self._description.manifest.runs if self._description.manifest else ()
         bad = {found.file for found in self.findings}
-        recipes = {
-            run.name: run.recipe
-            for run in runs
-            if run.recipe is not None and run.kind not in (*FOREIGN_KINDS, "subset")
-        }
+        recipes = {run.name: run.recipe for run in runs if run.recipe and can_be_made_again(run)}
         keys = [key for key in self._description.table if part_file(key) not in bad and key.run in recipes]
+        files = files_of_parts(self._folder, self._description.table, bad=bad) if number else {}
         replays = []
         for key in spread_parts(keys, number):
             file = self._folder / part_file(key)
             try:
                 with Archive(file) as archive:
-                    replay = replay_part(archive, read_part_record(archive), key, recipes[key.run])
+                    record = read_part_record(archive)
+                    replay = replay_part(archive, record, key, recipes[key.run], files)
             except (StoreError, ManifestError) as error:  # the quick level has not opened it
                 self._add(part_file(key), words_after(error, file))
                 continue

@@ -1,0 +1,315 @@
+"""Making and publishing a part, whatever its episodes come from."""
+
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import ValidationError
+
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.canonical import canonical_json, digest
+from tcmrl_data.foundation.disk import STAGING, replace_file
+from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.foundation.records import first_problem
+from tcmrl_data.parts.operation import OPERATIONS, Operation, Simulator, Sources, StoredPart, WantedPart
+from tcmrl_data.parts.playback import Relabel
+from tcmrl_data.parts.rollouts import Extend, Rollout
+from tcmrl_data.parts.stored import Cut, Import
+from tcmrl_data.recipe.recipe import same_settings
+from tcmrl_data.store.archive import Archive, pack_archive
+from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
+from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.store.manifest import Run
+from tcmrl_data.store.part_files import check_members
+from tcmrl_data.store.part_record import (
+    DATA_VERSION,
+    PART_SCHEMA,
+    RECORD,
+    ArrayRecord,
+    Identity,
+    PartRecord,
+    References,
+    Statistics,
+    read_part_record,
+)
+from tcmrl_data.store.part_table import PartEntry, part_entry
+from tcmrl_data.store.platform import UNKNOWN, Platform
+
+NO_REFERENCES = References(uniform=None, oracle=None, scripted=None)
+"""Where nobody has measured any."""
+
+OWN_OPERATIONS: Mapping[str, type[Operation[Any]]] = {
+    operation.name: operation for operation in (Rollout, Cut, Extend, Relabel, Import)
+}
+"""Known without their entry points, which building would have to load."""
+
+QUANTILES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
+
+
+def operation_named(name: str) -> type[Operation[Any]]:
+    """The operation of a name, of this package or of another.
+
+    Raises:
+        UnknownNameError: no installed package declares it.
+        PluginError: the package that declares it is broken.
+    """
+    return OWN_OPERATIONS.get(name) or OPERATIONS.get(name)
+
+
+def operation_of_run(run: Run) -> type[Operation[Any]]:
+    """The operation that makes the parts of a run; errors as of `operation_named`."""
+    own = next((operation for operation in OWN_OPERATIONS.values() if run.kind in operation.kinds), None)
+    return own or operation_named(str((run.origin or {}).get("operation")))
+
+
+def operation_of(identity: Identity, place: str) -> Operation[Any]:
+    """The operation that makes a part.
+
+    Args:
+        identity: of the part.
+        place: of the part, for messages.
+
+    Raises:
+        ManifestError: its settings are not valid; names the place and the field.
+        UnknownNameError: no installed package has the operation.
+    """
+    derived = identity.derived
+    if derived is None:
+        return Import() if identity.seed is None or identity.policy is None else Rollout()
+    kind = operation_named(str(derived.get("operation"))[:64])
+    try:
+        return kind(kind.Settings.model_validate_json(canonical_json(derived.get("settings"))))
+    except ValidationError as error:
+        raise ManifestError(f"{place}: identity.derived.settings: {first_problem(error)}") from None
+
+
+def make_part(
+    wanted: WantedPart,
+    episodes: Sequence[Trajectory],
+    *,
+    references: References = NO_REFERENCES,
+    behavior: Mapping[str, Any] | None = None,
+    platform: Platform = UNKNOWN,
+) -> tuple[PartRecord, bytes]:
+    """The record and the archive of a part.
+
+    Args:
+        wanted: the part's identity but for its arrays.
+        episodes: at least one.
+        references: of the task.
+        behavior: what the behavior source records with its parts.
+        platform: on which the episodes were made.
+    """
+    arrays = pack(episodes)
+    snapshot, derived = wanted.snapshot, wanted.derived
+    identity = Identity(
+        data_version=wanted.data_version,
+        settings=dict(wanted.settings),
+        task=wanted.task.index,
+        parameters=dict(wanted.task.parameters),
+        step=wanted.step,
+        seed=wanted.seed,
+        policy=None if snapshot is None else snapshot.digest(),
+        arrays={
+            name: ArrayRecord.model_validate_json(canonical_json(record))
+            for name, record in array_digests(arrays).items()
+        },
+        derived=None if derived is None else dict(derived),
+    )
+    record = PartRecord(
+        schema_version=PART_SCHEMA,
+        id=digest(identity.model_dump(mode="json")),
+        identity=identity,
+        statistics=statistics(episodes),
+        references=references,
+        behavior=dict(behavior or {}),
+        platform=platform,
+    )
+    policy = {} if snapshot is None else snapshot.files()
+    record_bytes = canonical_json(record.model_dump(mode="json"))
+    return record, pack_archive(encode_arrays(arrays) | policy | {RECORD: record_bytes})
+
+
+def statistics(trajectories: Sequence[Trajectory]) -> Statistics:
+    """Return statistics and mergeable moments of a part."""
+    returns = np.array([trajectory.undiscounted_return for trajectory in trajectories])
+    success = [
+        bool(np.any(trajectory.extras["success"]))
+        for trajectory in trajectories
+        if "success" in trajectory.extras
+    ]
+    moments = {}
+    for name in ("observations", "actions"):
+        rows = np.concatenate([getattr(trajectory, name) for trajectory in trajectories]).astype(np.float64)
+        moments[name] = {
+            "count": len(rows),
+            "sum": rows.sum(axis=0).tolist(),
+            "sum_of_squares": np.square(rows).sum(axis=0).tolist(),
+        }
+    return Statistics(
+        episodes=len(trajectories),
+        steps=sum(len(trajectory) for trajectory in trajectories),
+        mean=float(returns.mean()),
+        std=float(returns.std()),
+        min=float(returns.min()),
+        max=float(returns.max()),
+        quantiles=tuple(float(quantile) for quantile in np.quantile(returns, QUANTILES)),
+        success_rate=float(np.mean(success)) if success else None,
+        moments=moments,
+    )
+
+
+def wanted_from(
+    operation: Operation[Any], source: StoredPart, *, task: Task, simulator: Simulator | None = None
+) -> WantedPart:
+    """The identity of the part that an operation makes of a stored one.
+
+    Args:
+        operation: with its settings.
+        source: the stored part.
+        task: of the new part.
+        simulator: of that task, for an operation that simulates: the new part goes by its recipe.
+    """
+    identity = source.record.identity
+    wanted = WantedPart(
+        settings=identity.settings,
+        task=task,
+        step=identity.step,
+        seed=identity.seed,
+        snapshot=source.snapshot,
+        derived=operation.derived(source.record),
+        data_version=identity.data_version,
+    )
+    if not operation.simulates:
+        return wanted
+    assert simulator is not None
+    return dataclasses.replace(
+        wanted, settings=simulator.recipe.unit_settings(), seed=simulator.seed, data_version=DATA_VERSION
+    )
+
+
+def make_from(
+    operation: Operation[Any],
+    source: StoredPart,
+    *,
+    task: Task,
+    simulator: Simulator | None = None,
+    references: References = NO_REFERENCES,
+) -> tuple[PartRecord, bytes]:
+    """The record and the archive of the part that an operation makes of a stored one.
+
+    Args:
+        operation: with its settings.
+        source: the stored part.
+        task: of the new part.
+        simulator: of that task, for an operation that simulates.
+        references: of that task; parts that are not simulated keep those of the stored one.
+    """
+    wanted = wanted_from(operation, source, task=task, simulator=simulator)
+    episodes = operation.make(wanted, Sources(simulator, (source,)))
+    record = source.record
+    if operation.simulates and simulator is not None:
+        platform = simulator.platform
+    else:
+        references, platform = record.references, record.platform
+    return make_part(wanted, episodes, references=references, behavior=record.behavior, platform=platform)
+
+
+@dataclass(frozen=True)
+class Published:
+    """A published part, as a worker reports it to the driver or as it is found on disk.
+
+    Attributes:
+        entry: its line of the table, but for `platform`, which only the driver knows.
+        platform: on which it was made.
+    """
+
+    entry: PartEntry
+    platform: Platform
+
+    @classmethod
+    def of_record(cls, record: PartRecord, *, run: str, archive: bytes) -> "Published":
+        """The part with a record, published as `archive` in a run."""
+        return cls(part_entry(record, run=run, platform=0, archive=archive), record.platform)
+
+    @classmethod
+    def from_message(cls, message: Mapping[str, Any]) -> "Published":
+        """The inverse of `to_message`."""
+        platform = Platform.model_validate_json(canonical_json(message["platform"]))
+        return cls(PartEntry(*message["entry"]), platform)
+
+    def to_message(self) -> dict[str, Any]:
+        """What a worker tells its driver."""
+        platform = self.platform.model_dump(mode="json")
+        return {"kind": "part", "entry": list(self.entry), "platform": platform}
+
+
+def read_published(file: Path, run: str) -> tuple[Published, PartRecord]:
+    """Reads a whole part that nobody has described yet, and its record.
+
+    Raises:
+        StoreError: it is damaged.
+        ManifestError: its record is.
+    """
+    with Archive(file) as archive:
+        record = read_part_record(archive)
+        check_members(archive, record)
+        for name in archive.names:
+            archive.read(name)  # compares its checksum
+        return Published.of_record(record, run=run, archive=archive.content()), record
+
+
+def publish(
+    folder: Path,
+    key: PartKey,
+    make: Callable[[], tuple[PartRecord, bytes]],
+    *,
+    wanted: WantedPart | None = None,
+) -> Published:
+    """Publishes a part; a sound one that is there is left alone, and a damaged one made again.
+
+    Args:
+        folder: of the dataset.
+        key: of the part.
+        make: makes its record and archive.
+        wanted: what a part that is there must be; any will do where None.
+
+    Raises:
+        StoreError: another part lies there.
+    """
+    file = folder / part_file(key)
+    if file.exists():
+        try:
+            published, record = read_published(file, key.run)
+        except (StoreError, ManifestError):
+            pass
+        else:
+            if wanted is not None and not _is_wanted(record.identity, wanted):
+                raise StoreError(f"{file}: holds another part; delete it or choose another --run")
+            return published
+    record, data = make()
+    replace_file(file, data, staging=folder / STAGING)
+    return Published.of_record(record, run=key.run, archive=data)
+
+
+def _is_wanted(identity: Identity, wanted: WantedPart) -> bool:
+    policy = None if wanted.snapshot is None else wanted.snapshot.digest()
+    found = (identity.derived, identity.policy, identity.seed, identity.parameters)
+    asked = (wanted.derived, policy, wanted.seed, wanted.task.parameters)
+    return found == asked and same_settings(identity.settings, wanted.settings)
+
+
+def numbered(parts: Iterable[Published], platforms: list[Platform]) -> list[PartEntry]:
+    """The parts' lines with the positions of their platforms; adds new platforms to the list."""
+    positions = {platform.digest(): position for position, platform in enumerate(platforms)}
+    entries = []
+    for part in parts:
+        position = positions.setdefault(part.platform.digest(), len(platforms))
+        if position == len(platforms):
+            platforms.append(part.platform)
+        entries.append(part.entry._replace(platform=position))
+    return entries

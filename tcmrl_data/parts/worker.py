@@ -1,0 +1,222 @@
+"""Parts made from stored ones in worker processes: `python -m tcmrl_data.parts.worker`."""
+
+import contextlib
+import dataclasses
+import functools
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.engine.base import ENGINES, Unit
+from tcmrl_data.engine.worker import Send, serve
+from tcmrl_data.foundation.canonical import canonical_json, digest
+from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.machine import available_cores
+from tcmrl_data.parts.making import (
+    NO_REFERENCES,
+    Published,
+    make_from,
+    operation_named,
+    publish,
+    wanted_from,
+)
+from tcmrl_data.parts.operation import Operation, Simulator, StoredPart
+from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.part_record import References
+from tcmrl_data.store.part_table import REFERENCES
+
+WORKER = "tcmrl_data.parts.worker"
+UNITS_PER_WORKER = 4
+"""Starting a process takes seconds, a part often less; few units balance well enough."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """A part that is to be made from another one.
+
+    Attributes:
+        source: the other part.
+        key: of the new part.
+    """
+
+    source: PartKey
+    key: PartKey
+
+
+@dataclass(frozen=True)
+class DeriveSpec:
+    """What a worker is told; JSON both ways.
+
+    Attributes:
+        source: folder of the dataset that is read.
+        out: folder where parts are published; may be the same one.
+        operation: name of the operation.
+        settings: what the settings of all its parts have in common.
+        recipe: that simulated parts go by.
+        seed: root seed of the parts that are read, and of the new ones; None where it is not known.
+        jobs: the parts to make.
+    """
+
+    source: Path
+    out: Path
+    operation: str
+    settings: Mapping[str, Any]
+    recipe: Recipe
+    seed: int | None
+    jobs: tuple[Job, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """JSON form."""
+        return {
+            "source": str(self.source),
+            "out": str(self.out),
+            "operation": self.operation,
+            "settings": dict(self.settings),
+            "recipe": self.recipe.model_dump(mode="json"),
+            "seed": self.seed,
+            "jobs": [[list(job.source), list(job.key)] for job in self.jobs],
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "DeriveSpec":
+        """The inverse of `to_json`."""
+        return cls(
+            Path(values["source"]),
+            Path(values["out"]),
+            values["operation"],
+            values["settings"],
+            Recipe.model_validate_json(canonical_json(values["recipe"])),
+            values["seed"],
+            tuple(Job(PartKey(*source), PartKey(*key)) for source, key in values["jobs"]),
+        )
+
+    def operation_on(self, dataset: Dataset, source: PartKey) -> Operation[Any]:
+        """The operation with the settings of the part that is made from `source`."""
+        kind = operation_named(self.operation)
+        settings = kind.settings_for(self.settings, dataset.task(source.task))
+        return kind(kind.Settings.model_validate_json(canonical_json(settings)))
+
+    def units(self, workers: int) -> list[Unit]:
+        """The jobs in units of whole tasks, a few for every worker."""
+        tasks = sorted({job.key.task for job in self.jobs})
+        size = -(-len(tasks) // (UNITS_PER_WORKER * workers)) or 1
+        units = []
+        for start in range(0, len(tasks), size):
+            chosen = set(tasks[start : start + size])
+            jobs = tuple(job for job in self.jobs if job.key.task in chosen)
+            spec = dataclasses.replace(self, jobs=jobs)
+            name = f"tasks {min(chosen)} to {max(chosen)}"
+            units.append(Unit(name, spec.to_json(), WORKER, cost=float(len(jobs))))
+        return units
+
+
+def derive_parts(
+    spec: DeriveSpec, *, workers: int | None, progress: Callable[[int, int], None] | None = None
+) -> list[Published]:
+    """Makes and publishes the parts of all jobs; parts that are there already are read and left alone.
+
+    Args:
+        spec: what to make.
+        workers: processes at the same time; one per core where None.
+        progress: called with parts done and parts in all.
+
+    Returns:
+        The parts, sorted by key.
+
+    Raises:
+        BuildError: a part cannot be made, or a worker crashed; what was published stands.
+    """
+    engine = ENGINES.get("local")(workers)
+    parts: dict[PartKey, Published] = {}
+    errors: list[str] = []
+
+    def take_in(unit: str, message: Mapping[str, Any]) -> None:
+        if message["kind"] == "part":
+            published = Published.from_message(message)
+            parts[published.entry.key] = published
+            if progress is not None:
+                progress(len(parts), len(spec.jobs))
+
+    with contextlib.closing(engine.run(spec.units(workers or available_cores()), take_in)) as results:
+        for result in results:
+            if result.error is not None:
+                errors.append(result.error)
+                break
+    missing = sorted({job.key for job in spec.jobs} - parts.keys())
+    if errors or missing:
+        raise BuildError(errors[0] if errors else f"{spec.out}: the part of {missing[0]} was not made")
+    return [parts[key] for key in sorted(parts)]
+
+
+def publish_jobs(spec: DeriveSpec, report: Send) -> str:
+    """Makes every missing part of the jobs, those of a task with one simulator.
+
+    Args:
+        spec: what to make.
+        report: receives a message per part.
+
+    Returns:
+        A digest over the ids of the parts.
+
+    Raises:
+        StoreError: another part lies where one is to be.
+    """
+    dataset = open_dataset(spec.source)
+    ids = []
+    for index in sorted({job.key.task for job in spec.jobs}):
+        with contextlib.ExitStack() as stack:
+            simulator = None
+            if operation_named(spec.operation).simulates:
+                assert spec.seed is not None  # the driver saw to it
+                simulator = Simulator(spec.recipe, seed=spec.seed, task=dataset.task(index))
+                stack.callback(simulator.close)
+            for job in spec.jobs:
+                if job.key.task == index:
+                    published = _publish(spec, dataset, job, simulator)
+                    report(published.to_message())
+                    ids.append(published.entry.id)
+    return digest(ids)
+
+
+def _publish(spec: DeriveSpec, dataset: Dataset, job: Job, simulator: Simulator | None) -> Published:
+    operation, source = spec.operation_on(dataset, job.source), StoredPart.of(dataset, job.source)
+    task, references = dataset.task(job.key.task), references_of(dataset, job.key.task)
+    wanted = wanted_from(operation, source, task=task, simulator=simulator)
+    make = functools.partial(
+        make_from, operation, source, task=task, simulator=simulator, references=references
+    )
+    return publish(spec.out, job.key, make, wanted=wanted)
+
+
+def references_of(dataset: Dataset, task: int) -> References:
+    """The reference returns that a dataset has for a task."""
+    entries = dataset.parts.entries_of(task)
+    if not entries:
+        return NO_REFERENCES
+    return References(**{name: getattr(entries[0], name) for name in REFERENCES})
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """One torch thread: digests depend on it, since reductions split by thread round differently."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def work(values: dict[str, Any], report: Send) -> str:
+    """Makes and publishes the parts of some jobs; the digest of their ids."""
+    with one_thread():
+        return publish_jobs(DeriveSpec.from_json(values), report)
+
+
+if __name__ == "__main__":
+    serve(work)
