@@ -59,14 +59,15 @@ from .interchange.importing import ImportReport as ImportReport
 from .interchange.importing import import_dataset as import_dataset
 from .interchange.readers.base import READERS as READERS
 from .interchange.recording import DatasetRecorder as DatasetRecorder
+from .operations.apply import apply_operation as apply_operation
 from .operations.derive import Derived as Derived
 from .operations.derive import derive_dataset as derive_dataset
+from .operations.derive import rename_dataset as rename_dataset
 from .operations.extend import ExtendReport as ExtendReport
 from .operations.extend import extend_dataset as extend_dataset
 from .operations.merge import merge_datasets as merge_datasets
 from .operations.relabel import RelabelReport as RelabelReport
 from .operations.relabel import relabel_dataset as relabel_dataset
-from .operations.rename import rename_dataset as rename_dataset
 from .operations.split import split_dataset as split_dataset
 from .quality.coverage import measure_coverage as measure_coverage
 from .quality.records import Coverage as Coverage

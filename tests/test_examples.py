@@ -167,6 +167,21 @@ def test_the_format_of_a_users_package_holds_every_episode(
         assert json.loads(str(arrays["task"]))["index"] == 0
 
 
+def test_the_operation_of_a_users_package_makes_a_dataset(
+    installation: Installation, pendulum: Path, tmp_path: Path
+) -> None:
+    """Its parts are made again by it, once they lie beside those that they were made from."""
+    out, both = tmp_path / "half", tmp_path / "both"
+    code = (
+        "import tcmrl_data; "
+        f"made = tcmrl_data.apply_operation({str(pendulum)!r}, {str(out)!r}, 'every-nth', {{'n': 2}}); "
+        "print(made.manifest.totals.episodes, made.manifest.runs[0].kind, made.manifest.runs[0].name)"
+    )
+    assert installation.call("python", "-c", code).split() == ["12", "derived", "every-nth"]
+    installation.call("tcmrl-data", "merge", pendulum, out, "--out", both, "--quiet")
+    installation.call("tcmrl-data", "verify", both, "--deep", "--quiet")
+
+
 def test_a_plug_in_that_cannot_be_imported_is_listed_with_its_error(installation: Installation) -> None:
     listing = installation.call("tcmrl-data", "envs")
     assert "pendulum" in listing and "point-robot" in listing

@@ -1,4 +1,4 @@
-"""A new dataset that is put together from parts, resumably."""
+"""Datasets put together from parts, resumably: a new one, or one that gets further parts in its place."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -21,18 +21,19 @@ from tcmrl_data.foundation.disk import (
     replace_file,
     sync_files,
 )
-from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.errors import BuildError, StoreError
 from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.foundation.records import write_ranges
-from tcmrl_data.parts.making import Published, publish
+from tcmrl_data.parts.making import Published, numbered, publish
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.limits import MAX_PARTS
-from tcmrl_data.store.manifest import Derivation, Manifest, Run, Source
+from tcmrl_data.store.limits import MAX_PARTS, MAX_PLATFORMS, MAX_RUNS
+from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, Run, Source, read_manifest, seal
 from tcmrl_data.store.part_record import PartRecord
-from tcmrl_data.store.part_table import PartEntry, PartTable
+from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, PartTable, part_line
 from tcmrl_data.store.platform import Platform
-from tcmrl_data.store.sealing import write_dataset
+from tcmrl_data.store.sealing import is_complete, totals_of, write_dataset
+from tcmrl_data.store.tables import TableWriter, read_sealed
 
 
 @dataclass(frozen=True)
@@ -256,3 +257,48 @@ def check_out(out: Path, derivation: Derivation) -> None:
 
 def _note(derivation: Derivation) -> bytes:
     return canonical_json(derivation.model_dump(mode="json"))
+
+
+def append_parts(dataset: Dataset, *, runs: Sequence[Run], parts: Sequence[Published]) -> Manifest:
+    """Adds published parts to a dataset; they belong to it as soon as the new manifest is there.
+
+    The lines of the parts are forced to disk before the manifest that seals them. A crash leaves the dataset
+    as it was, with files of parts that the same command finds again. The caller holds the dataset's lock.
+
+    Args:
+        dataset: as it stands on disk.
+        runs: all runs of the dataset from now on.
+        parts: the new parts, whose files are in their places.
+
+    Raises:
+        StoreError: the dataset has changed since it was opened.
+        BuildError: more parts, runs or platforms than a dataset may have.
+        StorageError: the operating system refuses an operation.
+    """
+    manifest, folder = dataset.manifest, dataset.folder
+    if read_manifest(folder).digest != manifest.digest:
+        raise StoreError(f"{folder} has changed meanwhile; run the same command again")
+    platforms = list(manifest.platforms)
+    entries = sorted(numbered(parts, platforms), key=lambda entry: entry.key)
+    recorded = dataset.recorded_parts.with_entries(entries)
+    for what, found, limit in (
+        ("parts", len(recorded), MAX_PARTS),
+        ("runs", len(runs), MAX_RUNS),
+        ("platforms", len(platforms), MAX_PLATFORMS),
+    ):
+        if found > limit:
+            raise BuildError(f"{folder} would have {found} {what}, more than the {limit} that are allowed")
+    table = TableWriter(folder / PARTS_TABLE, read_sealed(folder / PARTS_TABLE, manifest.parts))
+    table.append(b"".join(map(part_line, entries)))
+    table.sync()
+    kept = recorded.without_tasks(manifest.dropped)
+    fields = manifest.model_dump(mode="json", exclude={"digest"}) | {
+        "runs": [run.model_dump(mode="json") for run in runs],
+        "platforms": [platform.model_dump(mode="json") for platform in platforms],
+        "parts": table.seal.model_dump(),
+        "totals": totals_of(kept).model_dump(),
+        "root": kept.root,
+        "complete": is_complete(kept, runs, num_tasks=manifest.num_tasks),
+    }
+    replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
+    return read_manifest(folder)

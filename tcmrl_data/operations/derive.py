@@ -1,19 +1,24 @@
-"""`derive_dataset`: a selection of a dataset becomes a dataset or a view."""
+"""Deriving: a selection of a dataset becomes a dataset or a view; and a dataset's own name."""
 
-from collections.abc import Sequence
+import os
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.tiers import MEDIUM_SCORE, medium_scores
+from tcmrl_data.dataset.view import VIEW_SCHEMA, ViewedParts, is_view_file
 from tcmrl_data.envs.tasks import Split
-from tcmrl_data.foundation.errors import SelectionError, TierError
+from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json
+from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, replace_file
+from tcmrl_data.foundation.errors import SelectionError, StoreError, TierError
+from tcmrl_data.foundation.records import hidden_text, write_ranges
 from tcmrl_data.operations.assembly import check_out
-from tcmrl_data.operations.plan import Plan, Progress, carry_out
-from tcmrl_data.operations.rename import check_label
+from tcmrl_data.operations.planning import Plan, Progress, carry_out
 from tcmrl_data.operations.subset import Choice, plan_subset
-from tcmrl_data.operations.view_file import write_view
-from tcmrl_data.store.manifest import read_manifest
+from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, dataset_folder, read_manifest, seal
+from tcmrl_data.store.sealing import totals_of
 
 TOLERANCE = 15.0
 """A medium snapshot whose score is further from 33 than this is hardly medium: 18 to 48 are near."""
@@ -171,3 +176,103 @@ def _far_from_medium(plan: Plan, rule: str, tolerance: float) -> dict[str, float
     (source,) = plan.sources
     scores = medium_scores(source, [task.index for task in plan.tasks])
     return {str(key): score for key, score in scores.items() if abs(score - MEDIUM_SCORE) > tolerance}
+
+
+def write_view(
+    file: Path,
+    source: Dataset,
+    keys: Iterable[PartKey],
+    *,
+    derivation: Derivation,
+    label: str | None,
+) -> None:
+    """Writes a view.
+
+    Args:
+        file: of the view; its name ends in `.json`.
+        source: the dataset, or a view of it.
+        keys: parts of the source, at least one.
+        derivation: how they were chosen.
+        label: the view's own name.
+
+    Raises:
+        StoreError: the file exists, its name is none for a view, or the view would be too large.
+    """
+    if not is_view_file(file):
+        raise StoreError(f"--view {file}: a view is a file whose name ends in .json, and is not {MANIFEST}")
+    if os.path.lexists(file):
+        raise StoreError(f"--view {file} exists; choose another name or remove it")
+    chosen = set(keys)
+    table = source.parts.only(chosen)
+    fields = {
+        "schema_version": VIEW_SCHEMA,
+        "source": os.path.relpath(source.folder.resolve(), file.parent.resolve()),
+        "source_root": source.sealed_root,
+        "label": label,
+        "derivation": derivation.model_dump(mode="json"),
+        "totals": totals_of(table).model_dump(),
+        "root": table.root,
+        "parts": [group.model_dump(mode="json") for group in _groups(chosen)],
+    }
+    data = canonical_json(fields | {"digest": digest(fields)})
+    try:
+        parse_json(data)
+    except ValueError as error:
+        raise StoreError(f"--view {file}: too many parts for a view ({error}); use --out instead") from None
+    replace_file(file, data)
+
+
+def _groups(keys: set[PartKey]) -> Iterator[ViewedParts]:
+    steps: dict[tuple[str, int], list[int]] = {}
+    for key in sorted(keys):
+        steps.setdefault((key.run, key.task), []).append(key.step)
+    tasks: dict[tuple[str, tuple[int, ...]], list[int]] = {}
+    for (run, task), members in steps.items():
+        tasks.setdefault((run, tuple(members)), []).append(task)
+    for (run, common), alike in sorted(tasks.items()):
+        yield ViewedParts(tasks=write_ranges(alike), steps=common, run=run)
+
+
+LONGEST_LABEL = 200
+
+
+def rename_dataset(path: str | Path, label: str) -> Manifest:
+    """Gives a dataset another label; its digest changes, its root does not, and its folder stays.
+
+    Args:
+        path: the dataset's folder or its `manifest.json`.
+        label: the new name, such as `pr/two-seeds`.
+
+    Returns:
+        The new manifest.
+
+    Raises:
+        SelectionError: the label is empty, too long, or holds control characters.
+        ManifestError: there is no dataset at the path.
+        LockedError: another process works on the dataset.
+        ReadOnlyError: the folder cannot be written.
+
+    Example:
+        >>> rename_dataset("data/pr-two-seeds", "pr/two-seeds")  # doctest: +SKIP
+    """
+    check_label(label)
+    folder = dataset_folder(path)
+    read_manifest(folder)
+    with lock_file(folder / LOCK, f"dataset {folder}"):
+        fields = read_manifest(folder).model_dump(mode="json", exclude={"digest"})
+        replace_file(folder / MANIFEST, seal(fields | {"label": label}), staging=folder / STAGING)
+        return read_manifest(folder)
+
+
+def check_label(label: str | None) -> None:
+    """Refuses a label that no manifest may hold.
+
+    Raises:
+        SelectionError: it is empty, too long, or holds control characters.
+    """
+    if label is not None and (
+        not label.strip() or len(label) > LONGEST_LABEL or "\n" in label or hidden_text(label, "label")
+    ):
+        raise SelectionError(
+            f"label {label[:40]!r}: expected 1 to {LONGEST_LABEL} characters that can be printed on a line"
+        )

@@ -10,10 +10,14 @@ from tcmrl_data.building.work_files import check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.disk import LOCK, lock_file, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, StoreError
-from tcmrl_data.operations.appending import append_parts
-from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
-from tcmrl_data.operations.pairs import nearest_pairs, runs_of_pairs
-from tcmrl_data.operations.stored import check_parts, keys_of_run, simulated_run
+from tcmrl_data.operations.assembly import Copied, append_parts, derivation_of, open_assembly
+from tcmrl_data.operations.planning import (
+    check_parts,
+    keys_of_run,
+    nearest_pairs,
+    runs_of_pairs,
+    simulated_run,
+)
 from tcmrl_data.parts.making import Published
 from tcmrl_data.parts.rollouts import EXTEND, MAX_NOISE
 from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts

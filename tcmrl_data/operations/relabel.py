@@ -10,8 +10,14 @@ from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError, SelectionError
 from tcmrl_data.operations.assembly import check_out, derivation_of, open_assembly
-from tcmrl_data.operations.pairs import Pair, nearest_pairs, runs_of_pairs
-from tcmrl_data.operations.stored import check_parts, keys_of_run, simulated_run
+from tcmrl_data.operations.planning import (
+    Pair,
+    check_parts,
+    keys_of_run,
+    nearest_pairs,
+    runs_of_pairs,
+    simulated_run,
+)
 from tcmrl_data.parts.making import wanted_from
 from tcmrl_data.parts.operation import Simulator, Sources, StoredPart
 from tcmrl_data.parts.playback import RELABEL

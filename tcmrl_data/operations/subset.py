@@ -14,7 +14,7 @@ from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator
 from tcmrl_data.operations.assembly import derivation_of
-from tcmrl_data.operations.plan import Plan, PlannedPart, settle_runs
+from tcmrl_data.operations.planning import Plan, PlannedPart, settle_runs
 from tcmrl_data.parts.stored import SUBSET, Cut
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_record import STANDARD_ARRAYS

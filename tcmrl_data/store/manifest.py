@@ -28,7 +28,7 @@ MANIFEST = "manifest.json"
 
 _Index = Annotated[int, Field(ge=0, lt=MAX_INDEX)]
 
-RunKind = Literal["built", "extended", "relabelled", "imported", "recorded", "subset"]
+RunKind = Literal["built", "extended", "relabelled", "derived", "imported", "recorded", "subset"]
 
 FOREIGN_KINDS: tuple[RunKind, ...] = ("imported", "recorded")
 """Runs whose episodes were not made here: nothing of them can be made again."""

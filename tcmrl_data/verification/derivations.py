@@ -7,8 +7,8 @@ from typing import Any
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.errors import SelectionError, TcmrlError
 from tcmrl_data.foundation.plain_files import one_line
-from tcmrl_data.operations.merging import MERGE, plan_merge
-from tcmrl_data.operations.plan import Plan, PlannedPart
+from tcmrl_data.operations.merge import MERGE, plan_merge
+from tcmrl_data.operations.planning import Plan, PlannedPart
 from tcmrl_data.operations.split import EPISODES, FOLD, plan_episodes, plan_fold
 from tcmrl_data.operations.subset import Choice, plan_subset
 from tcmrl_data.parts.stored import SUBSET, read_cut

@@ -12,7 +12,14 @@ from pydantic import ValidationError
 
 from tcmrl_data.foundation.errors import ManifestError, SnapshotError, StoreError, TcmrlError
 from tcmrl_data.parts.making import operation_of
-from tcmrl_data.parts.operation import Simulator, Sources, StoredPart, WantedPart, can_be_made_again
+from tcmrl_data.parts.operation import (
+    Operation,
+    Simulator,
+    Sources,
+    StoredPart,
+    WantedPart,
+    can_be_made_again,
+)
 from tcmrl_data.parts.worker import one_thread
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
@@ -83,7 +90,7 @@ def replay_part(
         with contextlib.ExitStack() as stack:
             simulator = None
             if operation.simulates:
-                _check_cost(archive, record, recipe)
+                _check_cost(operation, archive, record, recipe)
                 assert identity.seed is not None
                 simulator = Simulator(recipe, seed=identity.seed, task=stored.task)
                 stack.callback(simulator.close)
@@ -174,10 +181,10 @@ def _contradictions(record: PartRecord, source: PartRecord) -> Iterator[str]:
         yield "its episodes are not those of"
 
 
-def _check_cost(archive: Archive, record: PartRecord, recipe: Recipe) -> None:
+def _check_cost(operation: Operation[Any], archive: Archive, record: PartRecord, recipe: Recipe) -> None:
     """Refuses lane batches and numbers of episodes that the part's size does not justify."""
     stored = record.identity.arrays["episode_offsets"].shape[0] - 1
-    if stored != recipe.rollouts.episodes:
+    if operation.own_seeds and stored != recipe.rollouts.episodes:
         raise ValueError(f"{stored} episodes are stored, the recipe has {recipe.rollouts.episodes}")
     horizon, lanes = recipe.environment.horizon, recipe.rollouts.lanes
     shapes = record.identity.arrays
