@@ -1,4 +1,4 @@
-"""The `[about]` table: what a dataset says of itself, and the works that it asks to be cited with it."""
+"""The `[about]` table: a dataset's description, licence and authors, and the works to cite with it."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -12,7 +12,7 @@ from tcmrl_data.foundation.records import validate_table
 Text = Annotated[str, Field(min_length=1)]
 
 DOI = re.compile(r"10\.\d{4,9}(\.\d+)?/[A-Za-z0-9:/_;\-.()\[\]\\]+")
-"""The form that the Citation File Format 1.2 asks of a DOI."""
+"""A DOI in the form that the Citation File Format 1.2 requires."""
 
 URL = re.compile(r"https?://[^\s\"<>{}|\\^`]+")
 
@@ -21,7 +21,7 @@ AND = " AND "
 
 
 def licence_problem(text: str) -> str | None:
-    """Why a text is no licence, in words for an error message; None if it is one.
+    """Why a text is not a licence, for an error message; None if it is one.
 
     A licence is an SPDX identifier, a `LicenseRef-NAME`, or several of them joined by `AND` or `OR`.
     """
@@ -34,7 +34,7 @@ def licence_problem(text: str) -> str | None:
 
 
 def _spelled(name: str) -> str | None:
-    """A licence as SPDX spells it; None if SPDX does not know it."""
+    """A licence in SPDX's spelling; None if SPDX does not know it."""
     from packaging.licenses import InvalidLicenseExpression, canonicalize_license_expression
 
     try:
@@ -49,18 +49,18 @@ def is_listed(name: str) -> bool:
 
 
 def joined_licences(licences: list[str]) -> str:
-    """The licence of something that is under all the given ones, each named once, in order."""
+    """The licence of something to which all given licences apply; sorted, each named once."""
     return AND.join(sorted({name for licence in licences for name in licence.split(AND)}))
 
 
 class _Plain(BaseModel):
-    """A table that is written without the fields that are not set."""
+    """A table that is written without its unset fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     @model_serializer(mode="wrap")
     def _without_unset(self, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-        """A manifest of a recipe without these fields has the bytes that it had before the fields existed."""
+        """Keeps the bytes of manifests whose recipe does not set fields that were added later."""
         return {
             name: value
             for name, value in write(self).items()
@@ -72,7 +72,7 @@ class Reference(_Plain):
     """A published work.
 
     Attributes:
-        authors: `Family, Given` for people; a name without a comma is that of a group.
+        authors: people as `Family, Given`; a name without a comma is a group.
         venue: conference or journal.
     """
 
@@ -85,14 +85,14 @@ class Reference(_Plain):
 
 
 class About(_Plain):
-    """What a dataset says of itself; no part of any digest.
+    """Description of a dataset, which is not part of any digest.
 
     Attributes:
-        citation: in a sentence, what the environment is from.
-        licence: an SPDX expression; datasets of earlier versions and imported ones may say anything.
-        authors: who made the data: `Family, Given` for people; a name without a comma is that of a group.
+        citation: origin of the environment, in a sentence.
+        licence: an SPDX expression; any text in imported datasets and in those of earlier versions.
+        authors: who made the data; people as `Family, Given`, a name without a comma is a group.
         url: where the dataset is published.
-        doi: of the dataset.
+        doi: DOI of the dataset.
         references: works to be cited with the dataset.
     """
 
@@ -106,14 +106,10 @@ class About(_Plain):
 
 
 def read_about(values: Mapping[str, Any], place: str) -> About:
-    """The `[about]` table of a recipe that someone wrote.
-
-    Args:
-        values: the table.
-        place: of the recipe, for error messages.
+    """Validates the `[about]` table of a recipe; error messages begin with `place`.
 
     Raises:
-        RecipeError: an unknown key, a wrong type, or a licence, DOI or URL that is none.
+        RecipeError: an unknown key, a wrong type, or an invalid licence, DOI or URL.
     """
     about = validate_table(About, values, place=place, error=RecipeError, table="about")
     problem = licence_problem(about.licence)
@@ -130,10 +126,9 @@ def read_about(values: Mapping[str, Any], place: str) -> About:
 
 
 def merged_about(abouts: Sequence[About]) -> About:
-    """What the union of equal data says of itself: all licences, authors, citations and references.
+    """The table of a union of datasets: all their licences, authors, citations and references.
 
-    Args:
-        abouts: at least one; the description is the first one's, and so are URL and DOI if all agree.
+    The description is that of the first dataset. URL and DOI are kept if they are the same in all.
     """
     first = abouts[0]
     if all(about == first for about in abouts):

@@ -1,4 +1,4 @@
-"""Recipe files: TOML that people write, read and merged, but not yet validated."""
+"""Recipe files: TOML files, parsed and merged but not yet validated."""
 
 import tomllib
 from collections.abc import Mapping, Sequence
@@ -15,7 +15,7 @@ RECIPE_SCHEMA = 1
 REQUIRED_TABLES = ("about", "behavior", "environment", "rollouts")
 TABLES = sorted([*REQUIRED_TABLES, "build", "training"])
 SUFFIX = ".toml"
-"""Ends the name of a recipe file; no environment's name ends in it."""
+"""Ending of a recipe file's name, and of no environment's name."""
 
 
 @dataclass(frozen=True)
@@ -24,9 +24,9 @@ class RecipeDocument:
 
     Attributes:
         environment: the environment's name.
-        place: what error messages call the document.
+        place: the document's name in error messages.
         text: the file's text.
-        content: its tables as they stand in the file, variants and profiles included.
+        content: the file's tables, including variants and profiles.
     """
 
     environment: str
@@ -40,15 +40,15 @@ class RecipeDocument:
         return [name for name in PROFILES if name == "paper" or name in self.content.get("profiles", {})]
 
     def layers(self, profile: Profile) -> list[tuple[str, ...]]:
-        """Paths of the tables that are merged for a profile, the later on top of the earlier."""
+        """Paths of the tables that are merged for a profile; later ones override earlier ones."""
         return [(), ("variants", self.environment), ("profiles", profile)]
 
     def tables(self, profile: Profile, overrides: Sequence[str] = ()) -> dict[str, Any]:
-        """The document's tables with the variant, the profile, and overrides on top.
+        """The document's tables, overridden by the variant, then the profile, then the overrides.
 
         Raises:
-            RecipeError: the document lacks the profile or a table, has an unknown table, or a value in the
-                place of a table; or as of `apply_overrides`.
+            RecipeError: the profile or a required table is missing, a table is unknown, a value stands where
+                a table should be, or an override is invalid (see `apply_overrides`).
         """
         if profile not in self.profiles:
             raise RecipeError(
@@ -79,7 +79,7 @@ def open_recipe(name_or_file: str | Path) -> RecipeDocument:
 
     Raises:
         UnknownNameError: no such environment.
-        RecipeError: no such file, or no recipe in it.
+        RecipeError: the file does not exist or is not a recipe.
     """
     text = str(name_or_file)
     if text.endswith(SUFFIX):
@@ -136,7 +136,7 @@ def apply_overrides(table: Mapping[str, Any], overrides: Sequence[str]) -> dict[
     """A copy of nested tables with `section.key=value` texts applied; values are read as TOML.
 
     Raises:
-        RecipeError: a text without `=`, a value that is no TOML, or a section that is a plain value.
+        RecipeError: a text has no `=`, or its section is a value.
     """
     result = merge_tables({}, table)
     for text in overrides:

@@ -3,6 +3,6 @@
 from typing import Literal, get_args
 
 Profile = Literal["paper", "quick", "reduced"]
-"""`paper` is a recipe as written; the others are its smaller forms."""
+"""`paper` is the recipe itself; the other profiles are smaller."""
 
 PROFILES: tuple[Profile, ...] = get_args(Profile)

@@ -28,8 +28,8 @@ class Rollouts(_Table):
 
     Attributes:
         episodes: stochastic trajectories per snapshot (paper, Appendix F.1: 50).
-        lanes: episodes stepped together; part of the data's identity, since a batched network call
-            rounds differently for another batch size.
+        lanes: episodes stepped together; part of the data's identity, because the batch size of a network
+            call affects rounding.
     """
 
     episodes: int = Field(ge=1)
@@ -43,7 +43,7 @@ class Rollouts(_Table):
 
 
 class NoRollouts(Rollouts):
-    """The rollouts of a run whose episodes come from elsewhere: none."""
+    """The rollouts of imported data: none."""
 
     episodes: Literal[0] = 0
     lanes: Literal[0] = 0
@@ -54,15 +54,17 @@ class NoRollouts(Rollouts):
 
 
 class TaskChoice(_Table):
-    """The `[build]` table: which tasks, and what a unit takes; no part of any digest.
+    """The `[build]` table: the tasks, and the resources of a unit (a task or group of tasks).
+
+    It is not part of any digest.
 
     Attributes:
-        train_tasks: how many, evenly spaced along the environment's ordering; all where unset.
-        test_tasks: how many, as the training tasks; all where unset.
-        cpus: cores that a cluster reserves for a unit, a task or a group of tasks.
-        gpus: graphics processors that a cluster reserves for a unit; a fraction shares one.
-        memory: bytes that a cluster reserves for a unit, where more than planned.
-        timeout: seconds after which an attempt at a unit is ended; no limit where unset.
+        train_tasks: number of training tasks, evenly spaced along the environment's ordering; all by default.
+        test_tasks: number of test tasks, likewise.
+        cpus: cores that a cluster reserves for a unit.
+        gpus: GPUs that a cluster reserves for a unit; a fraction shares one.
+        memory: bytes that a cluster reserves for a unit, if this is more than planned.
+        timeout: seconds after which an attempt at a unit is stopped; no limit by default.
     """
 
     train_tasks: int | None = Field(default=None, ge=2)
@@ -95,10 +97,9 @@ class BehaviorTable(_Table):
     """The `[behavior]` table with the chosen source's settings.
 
     Attributes:
-        source: name of the behavior source.
-        observation: view that the behavior policies see.
-        reward: reward that they learn from.
-        settings: of the source; kept as they are, `make_source` validates them.
+        observation: view that the behavior policies receive.
+        reward: reward that they are trained on.
+        settings: the source's settings as they were recorded; `make_source` validates them.
     """
 
     source: str
@@ -119,7 +120,7 @@ class Recipe(_Table):
     """A resolved recipe: one environment, one profile, one behavior source.
 
     Attributes:
-        training: per profile, the training defaults that go with the data; validated by `tcmrl train`.
+        training: training defaults by profile; `tcmrl train` validates them.
     """
 
     profile: Profile
@@ -131,7 +132,7 @@ class Recipe(_Table):
     training: dict[Profile, dict[str, Any]]
 
     def unit_settings(self) -> dict[str, Any]:
-        """Everything that determines the data of a part, beside task and seed."""
+        """Everything except task and seed that determines the data of a part."""
         return self.model_dump(mode="json", include={"environment", "behavior", "rollouts"})
 
     def make_environment(self) -> Environment:
@@ -151,7 +152,7 @@ def load_recipe(
     overrides: Sequence[str] = (),
     behavior: str | None = None,
 ) -> Recipe:
-    """The recipe of an environment, or a recipe file, resolved.
+    """Loads and resolves the recipe of an environment, or a recipe file.
 
     Args:
         name_or_file: the environment, such as `point-robot` or `ml1/reach`, or the path of a recipe file,
@@ -162,8 +163,8 @@ def load_recipe(
 
     Raises:
         UnknownNameError: no such environment or behavior source.
-        RecipeError: no such file, a profile that the recipe lacks, an unknown key, a wrong type, or values
-            that contradict each other.
+        RecipeError: the file or the profile does not exist, a key is unknown, or values have a wrong type or
+            contradict each other.
     """
     document = open_recipe(name_or_file)
     _check_overrides(overrides)
@@ -189,17 +190,14 @@ def load_recipe(
 
 
 def full_settings(recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """Unit settings that a manifest or a part recorded, with the defaults of the fields that they lack.
+    """Completes recorded unit settings by defaults, for comparison with `Recipe.unit_settings`.
 
-    A field that was added later thus makes no difference where it has its default, which must give the data
-    that were made before. The result compares with `Recipe.unit_settings`.
-
-    Args:
-        recorded: the result of `Recipe.unit_settings`, by this version or an older one.
+    A manifest or part of an older version lacks fields that were added later. The default of such a field
+    must give the same data as before.
 
     Raises:
-        UnknownNameError: an environment or behavior source that is not installed.
-        RecipeError: a key that this version does not know, or a value that is not valid.
+        UnknownNameError: the environment or behavior source is not installed.
+        RecipeError: a key is unknown to this version, or a value is invalid.
     """
     validated = functools.partial(validate_table, place="recorded settings", error=RecipeError)
     tables = validated(_UnitSettings, recorded)
@@ -214,9 +212,9 @@ def full_settings(recorded: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def same_settings(recorded: Mapping[str, Any], other: Mapping[str, Any]) -> bool:
-    """Whether two recorded unit settings are equal, with defaults where they lack a field.
+    """Whether two recorded unit settings are equal, with defaults for missing fields.
 
-    Settings that this version cannot read are equal only if they are written alike.
+    Settings that this version cannot read are equal only if their values are.
     """
     if recorded == other:
         return True
@@ -234,7 +232,7 @@ def _check_overrides(overrides: Sequence[str]) -> None:
 
 
 class _Behavior(_Table):
-    """What a recipe file says in `[behavior]` itself."""
+    """The `[behavior]` table of a recipe file, without the tables of sources."""
 
     source: str
     observation: View = "stored"
@@ -242,7 +240,7 @@ class _Behavior(_Table):
 
 
 def _behavior_table(tables: Mapping[str, Any], place: str) -> BehaviorTable:
-    """`[behavior]` with the settings of the source: its own table on top of that of the one it extends."""
+    """`[behavior]` with the settings of its source, whose table overrides that of the source it extends."""
     plain = {key: value for key, value in tables.items() if not isinstance(value, Mapping)}
     own = validate_table(_Behavior, plain, place=place, error=RecipeError, table="behavior")
     kind = BEHAVIOR_SOURCES.get(own.source)
@@ -257,7 +255,7 @@ def _behavior_table(tables: Mapping[str, Any], place: str) -> BehaviorTable:
 
 UNKNOWN = "unknown"
 UNKNOWN_BEHAVIOR = BehaviorTable(source=UNKNOWN, settings={})
-"""Of episodes whose policies nobody has described; no behavior source has this name."""
+"""Behavior of imported episodes, whose policies are not described; no behavior source has this name."""
 
 
 def foreign_recipe(
@@ -270,19 +268,10 @@ def foreign_recipe(
     extra_arrays: Mapping[str, str],
     licence: str | None,
 ) -> Recipe:
-    """The recipe of data of an unknown environment.
+    """The recipe of imported data whose environment is unknown; arguments as in `ForeignSettings`.
 
-    A manifest always has a recipe: that is where samplers, exports, `inspect` and training look for sizes,
-    horizon and training tables, which thus need no second path for imported data.
-
-    Args:
-        tasks: number of tasks.
-        train: number of training tasks.
-        horizon: steps of the longest episode.
-        observation_dim: width of observations.
-        action_dim: width of actions.
-        extra_arrays: dtypes of further per-step arrays, by name.
-        licence: of the data; None where it is not known.
+    Every manifest has a recipe, in which samplers, exports, `inspect` and training find sizes, horizon and
+    training tables. `licence` is None if it is unknown.
     """
     environment = {
         "name": Foreign.name,
@@ -311,11 +300,7 @@ def foreign_recipe(
 
 
 def bound_recipe(environment: str, *, licence: str | None) -> Recipe:
-    """The recipe of data that come from one of our environments, but not from a build of it.
-
-    Args:
-        environment: its name.
-        licence: of the data; None where it is not known.
+    """The recipe of imported data of an installed environment; `licence` is None if it is unknown.
 
     Raises:
         UnknownNameError: there is no such environment.
@@ -340,11 +325,7 @@ def bound_recipe(environment: str, *, licence: str | None) -> Recipe:
 
 
 def check_licence(licence: str | None) -> None:
-    """Checks the licence that someone gives for data from elsewhere.
-
-    Raises:
-        RecipeError: SPDX does not know it.
-    """
+    """Raises `RecipeError` if SPDX does not know the licence given for imported data."""
     problem = None if licence is None else licence_problem(licence)
     if problem:
         raise RecipeError(f"licence: {problem}")

@@ -1,4 +1,4 @@
-"""Which tasks a recipe chooses, and how they are put together."""
+"""The tasks that a recipe chooses, and their groups."""
 
 from collections.abc import Iterable, Sequence
 from itertools import groupby
@@ -11,13 +11,13 @@ from tcmrl_data.recipe.recipe import Recipe
 
 
 def spread(tasks: Sequence[Task], *, num_train: int, num_test: int, is_circular: bool = False) -> list[int]:
-    """Indices of `num_train` training and `num_test` test tasks, evenly spaced within their split, ascending.
+    """Indices, ascending, of `num_train` training and `num_test` test tasks, evenly spaced in their split.
 
-    The tasks are given in the order along which to spread. The first and the last task of a split are taken,
-    so that a smaller selection spans the same range; on a circle, where they are neighbors, the first alone.
+    Tasks are given in the order in which they are spaced. A selection contains the first and the last task of
+    a split, so that it covers the same range; on a circle, where these are neighbors, only the first.
 
     Raises:
-        TaskError: a split has fewer tasks than that.
+        TaskError: a split has fewer tasks.
     """
     chosen: list[int] = []
     for split, number in (("train", num_train), ("test", num_test)):
@@ -31,12 +31,12 @@ def spread(tasks: Sequence[Task], *, num_train: int, num_test: int, is_circular:
 
 
 def choose_tasks(recipe: Recipe, indices: Sequence[int] | None = None) -> list[Task]:
-    """The named tasks of a recipe, or those that its profile chooses, ascending.
+    """The tasks with the given indices, or else those of the recipe's profile, ascending.
 
-    A profile's tasks are evenly spaced along the environment's ordering, or by index where it has none.
+    A profile's tasks are evenly spaced along the environment's ordering, or by index if it has none.
 
     Raises:
-        TaskError: an index outside the task set, or a profile with more tasks than there are.
+        TaskError: an index does not exist, or the profile has more tasks than the task set.
     """
     environment = recipe.make_environment()
     tasks = draw_tasks(environment)
@@ -58,20 +58,17 @@ def choose_tasks(recipe: Recipe, indices: Sequence[int] | None = None) -> list[T
 
 
 def group_tasks(tasks: Iterable[Task], group_size: int) -> list[tuple[Task, ...]]:
-    """The tasks, ascending, put together where index // group_size is equal.
-
-    A group thus depends on the recipe and on which tasks are built, never on the machine.
-    """
+    """Groups of the tasks with equal index // group_size, ascending; the machine does not affect them."""
     ordered = sorted(tasks, key=lambda task: task.index)
     return [tuple(group) for _, group in groupby(ordered, key=lambda task: task.index // group_size)]
 
 
 def parse_indices(text: str, num_tasks: int, *, option: str = "--tasks") -> list[int]:
-    """Indices named by text such as `0-9,12`, sorted.
+    """The sorted indices in a text such as `0-9,12`.
 
     Raises:
-        TaskError: the text is no list of indices and ranges, or an index lies outside the task set; the
-            message names the option that the text came from.
+        TaskError: the text is not a list of indices and ranges, or an index does not exist; the message
+            names the option.
     """
     indices: set[int] = set()
     for item in text.split(","):

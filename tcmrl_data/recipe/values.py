@@ -1,4 +1,4 @@
-"""What recipes say: their values with the comments on where they come from, and the list of environments."""
+"""The values of recipes with the comments that name their sources, and the list of environments."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 KeyPath = tuple[str, ...]
 
 NOT_SHOWN = {("environment", "name"), ("about", "references")}
-"""Keys that `--set` does not take: a name that has no effect, and a list of tables."""
+"""Keys that `--set` does not accept: a name without effect, and a list of tables."""
 
 
 @dataclass(frozen=True)
@@ -28,9 +28,9 @@ class RecipeValue:
     """One value of a recipe.
 
     Attributes:
-        key: the name by which `--set` changes it.
-        value: JSON; None where it is not set.
-        source: what the recipe says of its origin; empty where it says nothing.
+        key: the key for `--set`.
+        value: a JSON value; None if it is not set.
+        source: the recipe's comment on the value's origin; empty if there is none.
     """
 
     key: str
@@ -72,7 +72,7 @@ def recipe_values(
 
 
 def _sources(document: RecipeDocument, profile: Profile, overrides: Sequence[str]) -> dict[KeyPath, str]:
-    """The source of every value, that of the uppermost layer that has the value."""
+    """The source of every value in the last layer that sets it."""
     comments = read_comments(document.text)
     sources: dict[KeyPath, str] = {}
     for layer in document.layers(profile):
@@ -87,7 +87,7 @@ def _sources(document: RecipeDocument, profile: Profile, overrides: Sequence[str
 
 
 def _resolved(recipe: Recipe) -> dict[KeyPath, Any]:
-    """The values of the validated tables, defaults included; all settings of the source below its name."""
+    """The values of the validated tables with defaults; the source's settings stand under its name."""
     behavior = recipe.behavior.model_dump(mode="json")
     behavior[recipe.behavior.source] = behavior.pop("settings")
     tables = recipe.unit_settings() | {"behavior": behavior, "build": recipe.build.model_dump(mode="json")}
@@ -95,10 +95,10 @@ def _resolved(recipe: Recipe) -> dict[KeyPath, Any]:
 
 
 def read_comments(text: str) -> dict[KeyPath, str]:
-    """The comment of every value of a valid TOML text, empty where there is none.
+    """The comment of every value of a valid TOML text; empty if there is none.
 
-    A value's comment is the one behind it; where there is none, the lines of comment directly above it;
-    where there are none, the lines of comment directly below the header of its table.
+    A value's comment is the one behind it, else the comment lines directly above it, else those directly
+    below the header of its table.
     """
     import tomlkit
 
@@ -115,7 +115,7 @@ def _collect_comments(
     of_table: str = "",
     is_below_header: bool = False,
 ) -> None:
-    """Adds the comments of a table's values; of_table: the comment of a value that has no other."""
+    """Adds the comments of a table's values; `of_table` is for values without their own."""
     from tomlkit.items import AoT, Comment, Table
 
     above: list[str] = []
@@ -159,7 +159,7 @@ class EnvironmentList:
 
 
 def list_environments() -> EnvironmentList:
-    """Every environment that has a recipe; one that fails is listed as broken and harms no other."""
+    """Every environment that has a recipe; those that fail are listed as broken."""
     rows, broken = [], ENVIRONMENTS.broken()
     for name in ENVIRONMENTS.members():
         try:
