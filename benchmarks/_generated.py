@@ -13,11 +13,12 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
+from tcmrl_data.foundation.records import sealed
 from tcmrl_data.parts.making import Published, make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.keys import PartKey, part_file, part_folder
-from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
+from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tcmrl_data.store.part_record import PartRecord, References
 from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartEntry, PartTable, part_line
 from tcmrl_data.store.tables import TableWriter
@@ -169,7 +170,7 @@ def write_many(folder: Path, plan: BuildPlan, *, num_tasks: int, file_bytes: int
         "root": table.root,
         "complete": num_tasks == len(plan.tasks),
     }
-    replace_file(folder / MANIFEST, seal(fields))
+    replace_file(folder / MANIFEST, sealed(fields))
     return table
 
 

@@ -10,6 +10,7 @@ import tcmrl_data
 from tcmrl_data import Dataset, Recipe
 from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.errors import RecipeError
+from tcmrl_data.foundation.records import sealed
 from tcmrl_data.recipe.about import (
     About,
     Reference,
@@ -18,7 +19,7 @@ from tcmrl_data.recipe.about import (
     merged_about,
     read_about,
 )
-from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
+from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tests.datasets import part_ids
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
@@ -41,7 +42,7 @@ def relicensed(folder: Path, about: dict[str, Any]) -> Path:
     del fields["digest"]
     for run in fields["runs"]:
         run["recipe"]["about"] = about
-    (folder / MANIFEST).write_bytes(seal(fields))
+    (folder / MANIFEST).write_bytes(sealed(fields))
     return folder
 
 
@@ -92,7 +93,7 @@ def test_a_dataset_of_an_earlier_version_opens_and_is_written_alike(tiny_copy: C
     tcmrl_data.rename_dataset(folder, "named")
     fields = parse_json((folder / MANIFEST).read_bytes())
     del fields["digest"]
-    assert seal(fields | {"label": None}) == before
+    assert sealed(fields | {"label": None}) == before
     assert read_manifest(folder).licences == ("my own words",)
 
 

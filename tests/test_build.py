@@ -36,7 +36,7 @@ from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store import archive as archive_module
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.manifest import MANIFEST, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_record import PART_SCHEMA, RECORD
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import TASKS as TASKS_TABLE
@@ -49,7 +49,7 @@ Copy = Callable[[], Path]
 
 def forget(folder: Path) -> None:
     """Leaves the parts of a dataset and nothing that names them."""
-    for name in (MANIFEST, TASKS_TABLE, PARTS_TABLE):
+    for name in (MANIFEST, MANIFEST_COPY, TASKS_TABLE, PARTS_TABLE):
         (folder / name).unlink()
 
 

@@ -28,6 +28,7 @@ from tcmrl_data import (
 )
 from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
 from tcmrl_data.foundation.errors import CacheError, ManifestError, StoreError
+from tcmrl_data.foundation.records import sealed
 from tcmrl_data.sampling import cache, cache_entry
 from tcmrl_data.sampling.cache import cached_rows, load_rows
 from tcmrl_data.sampling.cache_entry import RECORD_BYTES
@@ -36,7 +37,7 @@ from tcmrl_data.sampling.rows import Indices, PartRows, Table, read_rows
 from tcmrl_data.store.archive import pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays
 from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.manifest import MANIFEST, seal
+from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, parse_parts, part_line
 from tcmrl_data.store.tables import seal_of
 from tests.commands import Call, in_process
@@ -143,7 +144,7 @@ def forge(copy: Path, *, claim: str) -> Path:
     values["totals"]["bytes"] = sum(entry.size for entry in entries)
     values["root"] = values["root"] if claim == "root" else parse_parts(lines, copy).root
     values.pop("digest")
-    (copy / MANIFEST).write_bytes(seal(values))
+    (copy / MANIFEST).write_bytes(sealed(values))
     return copy
 
 

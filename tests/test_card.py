@@ -12,8 +12,9 @@ import tcmrl_data
 from tcmrl_data import Dataset
 from tcmrl_data.card.card import BEGIN, END, dataset_card
 from tcmrl_data.foundation.canonical import parse_json
+from tcmrl_data.foundation.records import sealed
 from tcmrl_data.quality.scores import measure_quality
-from tcmrl_data.store.manifest import MANIFEST, seal
+from tcmrl_data.store.manifest import MANIFEST
 from tests.commands import Call, assert_refused, in_process
 
 Copy = Callable[[], Path]
@@ -36,7 +37,7 @@ def changed(folder: Path, change: Callable[[dict[str, Any]], None]) -> Dataset:
     fields = parse_json((folder / MANIFEST).read_bytes())
     del fields["digest"]
     change(fields)
-    (folder / MANIFEST).write_bytes(seal(fields))
+    (folder / MANIFEST).write_bytes(sealed(fields))
     return tcmrl_data.open_dataset(folder)
 
 

@@ -8,7 +8,8 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import ENVIRONMENTS, BuildReport, Dataset, Recipe
-from tcmrl_data.store.manifest import MANIFEST, seal
+from tcmrl_data.foundation.records import sealed
+from tcmrl_data.store.manifest import MANIFEST
 from tests.commands import Call, assert_refused, in_process
 from tests.conftest import TASKS, TINY
 
@@ -259,7 +260,7 @@ def test_a_dataset_whose_environment_is_not_installed_is_still_listed_and_inspec
     values["name"] = "pole"
     recipe = values["runs"][0]["recipe"]
     recipe["environment"].update(name="pole", lengths=[0.5, 1.0])
-    (folder / MANIFEST).write_bytes(seal(values))
+    (folder / MANIFEST).write_bytes(sealed(values))
     code, output, _ = call("list", folder.parent, "--json")
     assert (code, [row.get("name") for row in json.loads(output)["datasets"]]) == (0, ["pole"])
     for subject in ("tasks", "snapshots", "returns"):

@@ -10,9 +10,10 @@ import pytest
 from tcmrl_data import Dataset, list_datasets, open_dataset
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TaskError
+from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.manifest import MANIFEST, seal
+from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part_record import RECORD
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.tables import seal_of
@@ -99,7 +100,7 @@ def rewritten(folder: Path, **changes: object) -> None:
     """Changes manifest fields and seals the manifest again."""
     values = json.loads((folder / MANIFEST).read_bytes()) | changes
     values.pop("digest")
-    (folder / MANIFEST).write_bytes(seal(values))
+    (folder / MANIFEST).write_bytes(sealed(values))
 
 
 def test_manifests_that_must_not_open(tiny_copy: Copy) -> None:

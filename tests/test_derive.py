@@ -14,9 +14,9 @@ import tcmrl_data
 from tcmrl_data import TIERS, Dataset, derive_dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TierError
-from tcmrl_data.foundation.records import count_ranges, read_ranges, write_ranges
+from tcmrl_data.foundation.records import count_ranges, read_ranges, sealed, write_ranges
 from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
+from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tcmrl_data.store.part_record import References
 from tests.commands import assert_refused, in_process
 from tests.graded import graded_dataset
@@ -205,7 +205,7 @@ def test_damage_and_changes_of_the_source_are_found(graded: Dataset, tmp_path: P
 
     def change(done: int, total: int) -> None:
         fields = read_manifest(copy).model_dump(mode="json", exclude={"digest"})
-        (copy / MANIFEST).write_bytes(seal(fields | {"label": "another"}))
+        (copy / MANIFEST).write_bytes(sealed(fields | {"label": "another"}))
 
     with pytest.raises(StoreError, match="has changed meanwhile"):
         derive_dataset(opened, tmp_path / "changed", tier="random", progress=change)

@@ -15,9 +15,10 @@ from tcmrl_data import BuildEvent, Dataset, Recipe, load_recipe, open_dataset, r
 from tcmrl_data.building import ledger
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError, ManifestError, TaskError
+from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store import limits, manifest, tables
 from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
+from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import parse_tasks, task_line
 from tests.conftest import TINY
@@ -311,7 +312,7 @@ def test_a_manifest_seals_as_many_lines_as_a_writer_may_write(
         fields = json.loads(file.read_bytes())
         del fields["digest"]
         fields[table]["lines"] = lines
-        file.write_bytes(seal(fields))
+        file.write_bytes(sealed(fields))
         if is_read:
             assert read_manifest(file).num_tasks in (5, most)
         else:
@@ -338,7 +339,7 @@ def test_a_field_with_a_new_default_leaves_older_datasets_as_they_are(
     for table in (fields, fields["runs"][0]["recipe"]["behavior"]):
         table.pop("digest", None)
         table.pop("observation", None)
-    (out / MANIFEST).write_bytes(seal(fields))
+    (out / MANIFEST).write_bytes(sealed(fields))
     old = ids(out)
     assert verify_dataset(out, level="deep", replay=2).findings == ()
     report = tcmrl_data.build_dataset(recipe, out, tasks=[3])
@@ -347,7 +348,7 @@ def test_a_field_with_a_new_default_leaves_older_datasets_as_they_are(
     assert verify_dataset(out, level="deep").findings == ()
     (out / part_file(PartKey(3, 20))).unlink()
     assert repair_dataset(out).failed == ()
-    for name in (MANIFEST, PARTS_TABLE, "tasks.jsonl"):
+    for name in (MANIFEST, MANIFEST_COPY, PARTS_TABLE, "tasks.jsonl"):
         (out / name).unlink()
     report = tcmrl_data.build_dataset(recipe, out, tasks=[0, 3])
     assert (report.built, report.present) == (0, 4)

@@ -13,7 +13,7 @@ from types import FrameType
 import pytest
 
 import tcmrl_data
-from tcmrl_data import open_dataset, repair_dataset, verify_dataset
+from tcmrl_data import derive_dataset, open_dataset, repair_dataset, verify_dataset
 from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, replace_file
 from tcmrl_data.foundation.errors import (
     BuildError,
@@ -21,9 +21,10 @@ from tcmrl_data.foundation.errors import (
     ManifestError,
     NondeterminismError,
 )
+from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store import sealing
 from tcmrl_data.store.keys import PARTS, PartKey, part_file
-from tcmrl_data.store.manifest import MANIFEST, read_manifest, seal
+from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.tables import seal_of
 from tcmrl_data.store.task_table import TASKS
@@ -134,7 +135,7 @@ def publish_in_reverse(folder: Path) -> None:
     fields = json.loads((folder / MANIFEST).read_bytes())
     del fields["digest"]
     fields["parts"] |= seal_of(table).model_dump(mode="json")
-    (folder / MANIFEST).write_bytes(seal(fields))
+    (folder / MANIFEST).write_bytes(sealed(fields))
     assert found(folder) == set()
 
 
@@ -151,9 +152,13 @@ def test_a_repair_killed_between_tables_and_manifest_is_finished_by_the_next(
         replaced.append(path.name)
         replace_file(path, data, staging=staging)
 
+    def end(folder: Path, data: bytes) -> None:
+        raise KeyboardInterrupt
+
     rot(folder / PARTS_TABLE)
     with monkeypatch.context() as patch:
         patch.setattr(sealing, "replace_file", replace_some)
+        patch.setattr(sealing, "write_manifest", end)
         with pytest.raises(KeyboardInterrupt):
             repair_dataset(folder)
     assert replaced == [TASKS, PARTS_TABLE][:num_files]
@@ -183,13 +188,64 @@ def test_a_part_that_comes_out_differently_replaces_nothing(
     assert {path: path.read_bytes() for path in data_files(folder)} == before
 
 
-def test_a_damaged_manifest_is_recovered_by_building_again(tiny_copy: Copy, tiny_folder: Path) -> None:
+@pytest.mark.parametrize("damage", [None, b"rot", b"{}\n"])
+def test_a_lost_or_damaged_manifest_is_restored_from_its_copy(
+    tiny_folder: Path, tmp_path: Path, damage: bytes | None
+) -> None:
+    """With what no build makes again: the derivation, the label, and further runs."""
+    folder = derive_dataset(tiny_folder, tmp_path / "derived", tasks=[0, 3], label="mine").out
+    good = (folder / MANIFEST).read_bytes()
+    assert (folder / MANIFEST_COPY).read_bytes() == good
+    if damage is None:
+        (folder / MANIFEST).unlink()
+    else:
+        (folder / MANIFEST).write_bytes(damage)
+    with pytest.raises(ManifestError, match=f"`tcmrl-data repair {folder}` restores it"):
+        open_dataset(folder)
+    rot(folder / TASKS)
+    assert MANIFEST in found(folder)
+    report = repair_dataset(folder)
+    assert (report.tables, report.left, found(folder)) == ((MANIFEST, TASKS), (), set())
+    assert (folder / MANIFEST).read_bytes() == good
+    assert repair_dataset(folder).tables == ()
+
+
+def test_a_damaged_copy_of_the_manifest_is_found_and_written_again(tiny_copy: Copy) -> None:
+    folder = tiny_copy()
+    rot(folder / MANIFEST_COPY)
+    assert found(folder) == {MANIFEST_COPY}
+    assert (repair_dataset(folder).tables, found(folder)) == ((), set())
+    (folder / MANIFEST_COPY).unlink()  # as in a dataset of an earlier version
+    assert found(folder) == set()
+    repair_dataset(folder)
+    assert (folder / MANIFEST_COPY).read_bytes() == (folder / MANIFEST).read_bytes()
+
+
+def test_a_flipped_bit_of_a_manifest_is_told_from_an_unknown_field(tiny_copy: Copy) -> None:
+    folder = tiny_copy()
+    data = (folder / MANIFEST).read_bytes()
+    (folder / MANIFEST).write_bytes(data.replace(b'"label"', b'"lcbel"', 1))
+    with pytest.raises(ManifestError, match="digest does not match its contents"):
+        open_dataset(folder)
+
+
+def test_a_build_does_not_take_a_dataset_without_its_manifest_for_a_new_one(tiny_copy: Copy) -> None:
     folder = tiny_copy()
     recipe = read_manifest(folder).recipe
-    (folder / MANIFEST).write_bytes(b"rot")
+    (folder / MANIFEST).unlink()
+    with pytest.raises(BuildError, match=f"has lost its manifest.json; `tcmrl-data repair {folder}`"):
+        tcmrl_data.build_dataset(recipe, folder)
+
+
+def test_a_manifest_without_a_copy_is_recovered_by_building_again(tiny_copy: Copy, tiny_folder: Path) -> None:
+    folder = tiny_copy()
+    recipe = read_manifest(folder).recipe
+    for name in (MANIFEST, MANIFEST_COPY):
+        (folder / name).write_bytes(b"rot")
     with pytest.raises(ManifestError, match=str(folder / MANIFEST)):
         repair_dataset(folder)
-    (folder / MANIFEST).unlink()
+    for name in (MANIFEST, MANIFEST_COPY):
+        (folder / name).unlink()
     tasks = [task.index for task in open_dataset(tiny_folder).tasks]
     report = tcmrl_data.build_dataset(recipe, folder, tasks=tasks)
     assert (report.built, report.root) == (0, read_manifest(tiny_folder).root)

@@ -7,11 +7,10 @@ from pathlib import Path
 
 import pytest
 
-import tcmrl_data
 from tcmrl_data import open_dataset, repair_dataset, verify_dataset
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.store.keys import PARTS
-from tcmrl_data.store.manifest import MANIFEST, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, restore_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import making_again
@@ -28,7 +27,9 @@ Copy = Callable[[], Path]
 def sound(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The tiny dataset with its parts in order of their keys, as a repair leaves them."""
     folder = tmp_path_factory.mktemp("rot") / "sound"
-    return base(tiny_folder, folder, keys=open_dataset(tiny_folder).parts)
+    base(tiny_folder, folder, keys=open_dataset(tiny_folder).parts)
+    restore_manifest(folder)  # writes the copy of it
+    return folder
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -82,12 +83,9 @@ def test_rot_is_named_and_repaired(
             write(folder / name, data)
             cases += 1
             assert found(folder) == {name}
-            if name in (TASKS, PARTS_TABLE):
+            if name in (MANIFEST, TASKS, PARTS_TABLE):
                 assert repair_dataset(folder).tables == (name,)
             else:
-                if name == MANIFEST:
-                    with pytest.raises(ManifestError, match=MANIFEST):
-                        repair_dataset(folder)
                 write(folder / name, good[name])
             assert content(folder) == good
         parts = {name: data for name, data in bad.items() if name not in BYTES}
@@ -113,14 +111,15 @@ def test_a_dataset_all_of_whose_parts_rotted_is_made_again(sound: Path, tmp_path
     assert content(folder) == good
 
 
-def test_a_rotten_manifest_is_deleted_and_built_again(sound: Path, tmp_path: Path) -> None:
+def test_a_rotten_manifest_and_a_rotten_part_are_repaired_together(sound: Path, tmp_path: Path) -> None:
     folder = tmp_path / "copy"
     shutil.copytree(sound, folder)
-    good, manifest = content(folder), read_manifest(sound)
-    tasks = [task.index for task in open_dataset(sound).tasks]
-    (folder / MANIFEST).unlink()
-    report = tcmrl_data.build_dataset(manifest.recipe, folder, tasks=tasks)
-    assert (report.built, report.present, report.root) == (0, 15, manifest.root)
+    good, chance = content(folder), random.Random(0)
+    parts = [name for name in good if name.endswith(".zip")]
+    for name in (MANIFEST, TASKS, parts[0]):
+        write(folder / name, damaged(good[name], chance))
+    report = repair_dataset(folder, workers=2)
+    assert (len(report.repaired), report.tables, report.left) == (1, (MANIFEST, TASKS), ())
     assert content(folder) == good
 
 

@@ -9,7 +9,7 @@ from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import open_run, resolve_for
 from tcmrl_data import load_recipe, open_dataset
-from tcmrl_data.store.manifest import seal
+from tcmrl_data.foundation.records import sealed
 from tests.commands import Call, in_process
 
 STEPS = "run.steps=2"
@@ -28,7 +28,7 @@ def older(tiny_copy: Callable[[], Path]) -> Path:
     del fields["digest"]
     for table in fields["runs"][0]["recipe"]["training"].values():
         del table["focal"]
-    file.write_bytes(seal(fields))
+    file.write_bytes(sealed(fields))
     return file.parent
 
 

@@ -18,7 +18,7 @@ from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
 from tcmrl_data.foundation.machine import size
 from tcmrl_data.recipe.recipe import Recipe, full_settings
 from tcmrl_data.store.keys import PARTS
-from tcmrl_data.store.manifest import MANIFEST, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_record import DATA_VERSION
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import TASKS
@@ -124,6 +124,8 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
     check_work_files(out)
     if (out / ASSEMBLY).exists() and not is_dataset:
         raise BuildError(f"{out} holds the beginning of a derived dataset; use another --out")
+    if not is_dataset and (out / MANIFEST_COPY).exists():
+        raise BuildError(f"{out} has lost its {MANIFEST}; `tcmrl-data repair {out}` restores it")
     if not is_dataset:
         return
     manifest = read_manifest(out)

@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.foundation.disk import STAGING, named_errors, replace_file
+from tcmrl_data.foundation.disk import named_errors
 from tcmrl_data.foundation.errors import (
     BuildError,
     ManifestError,
@@ -23,7 +23,7 @@ from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_file, part_folder
 from tcmrl_data.store.limits import MAX_PLATFORMS
-from tcmrl_data.store.manifest import MANIFEST, Run, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, Run, read_manifest, write_manifest
 from tcmrl_data.store.part_record import DATA_VERSION
 from tcmrl_data.store.part_table import (
     HEADER,
@@ -185,7 +185,7 @@ class Ledger:
         if not self._is_written(data) or self._has_more():
             self._task_writer.sync()
             self._part_writer.sync()
-            replace_file(self._out / MANIFEST, data, staging=self._out / STAGING)
+            write_manifest(self._out, data)
         self._sealed = time.monotonic()
         self._seal_seconds = self._sealed - began
 

@@ -13,6 +13,7 @@ from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.plain_files import file_problem
 from tcmrl_data.store.keys import PARTS
+from tcmrl_data.store.manifest import MANIFEST_COPY
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.task_table import TASKS
 
@@ -20,7 +21,7 @@ WORK_FOLDERS = {STAGING, CHECKPOINTS}
 ASSEMBLY = ".assembly.json"
 """What is being put together in a folder that is no dataset yet, see `operations/assembly.py`."""
 
-WORK_FILES = {LOCK, EVENTS, EARLIER_EVENTS, ASSEMBLY}
+WORK_FILES = {LOCK, EVENTS, EARLIER_EVENTS, ASSEMBLY, MANIFEST_COPY}
 """A verification looks at their kind only, never into them."""
 
 TABLES = {TASKS, PARTS_TABLE}

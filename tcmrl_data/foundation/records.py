@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from tcmrl_data.foundation.canonical import canonical_json
+from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import CheckpointError, ManifestError, TcmrlError
 from tcmrl_data.foundation.plain_files import printable
@@ -69,18 +69,34 @@ def read_record(
         raise error(f"{file}: {first_problem(problem)}{remedy}") from None
 
 
-def parse_record(kind: type[Kind], values: Any, file: object, *, version: int) -> Kind:
+def sealed(fields: Mapping[str, Any]) -> bytes:
+    """The bytes of a record that holds its own digest: canonical JSON, with that of all other fields."""
+    return canonical_json({**fields, "digest": digest(fields)})
+
+
+def parse_record(
+    kind: type[Kind], values: Any, file: object, *, version: int, data: bytes | None = None
+) -> Kind:
     """Validates parsed JSON strictly as a record of a dataset.
 
+    Args:
+        kind: class of the record.
+        values: the JSON.
+        file: where it comes from, for messages.
+        version: its schema version.
+        data: the file's content where it holds its own digest, which is compared before anything else.
+
     Raises:
-        ManifestError: another schema version, control characters, or invalid values; the message names the
-            file and the field.
+        ManifestError: another schema version, another digest, control characters, or invalid values; the
+            message names the file and the field.
     """
     found = values.get("schema_version") if isinstance(values, dict) else None
     if found != version or isinstance(found, bool):
         raise ManifestError(
             f"{file}: schema_version {repr(found)[:40]} is not {version}, which this version reads"
         )
+    if data is not None and sealed({key: values[key] for key in values if key != "digest"}) != data:
+        raise ManifestError(f"{file}: digest does not match its contents; the file was edited or damaged")
     text = canonical_json(values)
     # canonical JSON escapes every character outside printable ASCII, except DEL
     hidden = hidden_text(values) if b"\\" in text or b"\x7f" in text else None

@@ -23,12 +23,12 @@ from tcmrl_data.foundation.disk import (
 )
 from tcmrl_data.foundation.errors import BuildError, StoreError
 from tcmrl_data.foundation.plain_files import read_plain_file
-from tcmrl_data.foundation.records import write_ranges
+from tcmrl_data.foundation.records import sealed, write_ranges
 from tcmrl_data.parts.making import Published, numbered, publish
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.limits import MAX_PARTS, MAX_PLATFORMS, MAX_RUNS
-from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, Run, Source, read_manifest, seal
+from tcmrl_data.store.manifest import Derivation, Manifest, Run, Source, read_manifest, write_manifest
 from tcmrl_data.store.part_record import PartRecord
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, PartTable, part_line
 from tcmrl_data.store.platform import Platform
@@ -300,5 +300,5 @@ def append_parts(dataset: Dataset, *, runs: Sequence[Run], parts: Sequence[Publi
         "root": kept.root,
         "complete": is_complete(kept, runs, num_tasks=manifest.num_tasks),
     }
-    replace_file(folder / MANIFEST, seal(fields), staging=folder / STAGING)
+    write_manifest(folder, sealed(fields))
     return read_manifest(folder)

@@ -9,15 +9,22 @@ from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.tiers import MEDIUM_SCORE, medium_scores
 from tcmrl_data.dataset.view import VIEW_SCHEMA, ViewedParts, is_view_file
 from tcmrl_data.envs.tasks import Split
-from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json
-from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, replace_file
+from tcmrl_data.foundation.canonical import parse_json
+from tcmrl_data.foundation.disk import LOCK, lock_file, replace_file
 from tcmrl_data.foundation.errors import SelectionError, StoreError, TierError
-from tcmrl_data.foundation.records import hidden_text, write_ranges
+from tcmrl_data.foundation.records import hidden_text, sealed, write_ranges
 from tcmrl_data.operations.assembly import check_out
 from tcmrl_data.operations.planning import Plan, Progress, carry_out
 from tcmrl_data.operations.subset import Choice, plan_subset
 from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, dataset_folder, read_manifest, seal
+from tcmrl_data.store.manifest import (
+    MANIFEST,
+    Derivation,
+    Manifest,
+    dataset_folder,
+    read_manifest,
+    write_manifest,
+)
 from tcmrl_data.store.sealing import totals_of
 
 TOLERANCE = 15.0
@@ -214,7 +221,7 @@ def write_view(
         "root": table.root,
         "parts": [group.model_dump(mode="json") for group in _groups(chosen)],
     }
-    data = canonical_json(fields | {"digest": digest(fields)})
+    data = sealed(fields)
     try:
         parse_json(data)
     except ValueError as error:
@@ -260,7 +267,7 @@ def rename_dataset(path: str | Path, label: str) -> Manifest:
     read_manifest(folder)
     with lock_file(folder / LOCK, f"dataset {folder}"):
         fields = read_manifest(folder).model_dump(mode="json", exclude={"digest"})
-        replace_file(folder / MANIFEST, seal(fields | {"label": label}), staging=folder / STAGING)
+        write_manifest(folder, sealed(fields | {"label": label}))
         return read_manifest(folder)
 
 

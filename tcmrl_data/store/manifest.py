@@ -3,15 +3,17 @@
 Tasks and parts stand in tables beside it (`tables.py`). The manifest seals them by length and sha256.
 """
 
+import contextlib
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import FailFast, Field, field_validator, model_validator
 
 from tcmrl_data.envs.tasks import Split
-from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, canonical_json, digest, parse_json
+from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
+from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
+from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file, words_after
 from tcmrl_data.foundation.records import Record, parse_record, read_ranges
 from tcmrl_data.recipe.about import AND, joined_licences
 from tcmrl_data.recipe.profile import Profile
@@ -25,6 +27,8 @@ MANIFEST_SCHEMA = 2
 """Raised when the meaning or the layout of a dataset's files changes."""
 
 MANIFEST = "manifest.json"
+MANIFEST_COPY = ".manifest.json"
+"""The same bytes again, from which `restore_manifest` writes a manifest that was lost or damaged."""
 
 _Index = Annotated[int, Field(ge=0, lt=MAX_INDEX)]
 
@@ -228,11 +232,6 @@ class Manifest(Record):
         return self
 
 
-def seal(fields: dict[str, Any]) -> bytes:
-    """The bytes of a manifest with the given fields: canonical JSON with its own digest."""
-    return canonical_json(fields | {"digest": digest(fields)})
-
-
 def dataset_folder(path: str | Path) -> Path:
     """The folder of a dataset, given the folder or its `manifest.json`."""
     path = Path(path)
@@ -245,7 +244,62 @@ def read_manifest(path: Path) -> Manifest:
     Raises:
         ManifestError: missing, truncated, edited, or of another schema version; names file and field.
     """
-    file = dataset_folder(path) / MANIFEST
+    folder = dataset_folder(path)
+    try:
+        return _parse_manifest(folder / MANIFEST)[1]
+    except ManifestError as error:
+        if not (folder / MANIFEST_COPY).exists():
+            raise
+        raise ManifestError(f"{error}; `tcmrl-data repair {folder}` restores it from its copy") from None
+
+
+def write_manifest(folder: Path, data: bytes) -> None:
+    """Replaces the manifest of a dataset, which is another one from then on, and then the copy of it.
+
+    Raises:
+        StorageError: the operating system refuses an operation.
+    """
+    for name in (MANIFEST, MANIFEST_COPY):
+        replace_file(folder / name, data, staging=folder / STAGING)
+
+
+def restore_manifest(folder: Path) -> bool:
+    """Writes the manifest again from its copy if it is lost or damaged, or the copy if that is.
+
+    Returns:
+        Whether the manifest had to be restored.
+
+    Raises:
+        ManifestError: the manifest is lost or damaged, and so is its copy.
+    """
+    try:
+        data, _ = _parse_manifest(folder / MANIFEST)
+        is_lost = False
+    except ManifestError as error:
+        try:
+            data, _ = _parse_manifest(folder / MANIFEST_COPY)
+        except ManifestError:
+            raise error from None
+        is_lost = True
+    with contextlib.suppress(OSError, ValueError):
+        if not is_lost and read_plain_file(folder / MANIFEST_COPY, limit=MAX_JSON_BYTES) == data:
+            return False
+    write_manifest(folder, data)
+    return is_lost
+
+
+def copy_problem(folder: Path) -> str | None:
+    """Why the manifest cannot be restored from its copy; None where it can, or there never was one."""
+    try:
+        if (folder / MANIFEST_COPY).exists():
+            _parse_manifest(folder / MANIFEST_COPY)
+    except ManifestError as error:
+        return words_after(error, folder / MANIFEST_COPY)
+    return None
+
+
+def _parse_manifest(file: Path) -> tuple[bytes, Manifest]:
+    """The content of a manifest's file, and what it says; errors as of `read_manifest`."""
     try:
         data = read_plain_file(file, limit=MAX_JSON_BYTES)
         values = parse_json(data)
@@ -254,15 +308,9 @@ def read_manifest(path: Path) -> Manifest:
             f"{file} does not exist; build a dataset with `tcmrl-data build ENV --out {file.parent}`"
         ) from None
     except (OSError, ValueError) as error:
-        raise ManifestError(
-            f"{file}: not a manifest ({one_line(error)}); build again or restore the file"
-        ) from None
+        raise ManifestError(f"{file}: not a manifest ({one_line(error)})") from None
     _refuse_older(values, file)
-    manifest = parse_record(Manifest, values, file, version=MANIFEST_SCHEMA)
-    fields = {key: value for key, value in values.items() if key != "digest"}
-    if seal(fields) != data:
-        raise ManifestError(f"{file}: digest does not match its contents; the file was edited or damaged")
-    return manifest
+    return data, parse_record(Manifest, values, file, version=MANIFEST_SCHEMA, data=data)
 
 
 def _refuse_older(values: Any, file: Path) -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.disk import STAGING, replace_file
+from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store.manifest import (
-    MANIFEST,
     MANIFEST_SCHEMA,
     Derivation,
     Manifest,
@@ -14,7 +14,7 @@ from tcmrl_data.store.manifest import (
     TableSeal,
     Totals,
     read_manifest,
-    seal,
+    write_manifest,
 )
 from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartTable, part_line
 from tcmrl_data.store.platform import Platform
@@ -66,9 +66,9 @@ def write_dataset(
         TASKS: b"".join(task_line(task) for task in sorted(tasks, key=lambda task: task.index)),
         PARTS_TABLE: HEADER + b"".join(map(part_line, table.entries())),
     }
-    for file, data in tables.items():
-        replace_file(folder / file, data, staging=folder / STAGING)
-    sealed = manifest_bytes(
+    for file, lines in tables.items():
+        replace_file(folder / file, lines, staging=folder / STAGING)
+    data = manifest_bytes(
         name=name,
         label=label,
         data_version=data_version,
@@ -80,7 +80,7 @@ def write_dataset(
         dropped=dropped,
         kept=table.without_tasks(dropped),
     )
-    replace_file(folder / MANIFEST, sealed, staging=folder / STAGING)
+    write_manifest(folder, data)
     return read_manifest(folder)
 
 
@@ -126,7 +126,7 @@ def manifest_bytes(
         "root": kept.root,
         "complete": is_complete(kept, runs, num_tasks=tasks.lines - len(dropped)),
     }
-    return seal(fields)
+    return sealed(fields)
 
 
 def is_complete(table: PartTable, runs: Sequence[Run], *, num_tasks: int) -> bool:

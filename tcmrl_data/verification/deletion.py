@@ -17,7 +17,7 @@ from tcmrl_data.building.work_files import (
 from tcmrl_data.foundation.disk import LOCK, disk, lock_file, lock_holder, named_errors, remove_tree
 from tcmrl_data.foundation.errors import LockedError, StoreError
 from tcmrl_data.store.keys import PARTS, is_part_folder, key_of_file
-from tcmrl_data.store.manifest import MANIFEST, dataset_folder, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, dataset_folder, read_manifest
 from tcmrl_data.verification.scan import Scan, scan_dataset
 
 NO_REMEDY = "delete the folder yourself if it is to go"
@@ -94,6 +94,7 @@ def _is_own(file: str, mode: int) -> bool:
 
 
 def _remove(folder: Path, scan: Scan) -> None:
+    (folder / MANIFEST_COPY).unlink(missing_ok=True)
     if MANIFEST in scan.files:
         (folder / MANIFEST).unlink()
         disk.sync(folder)

@@ -22,7 +22,7 @@ from tcmrl_data.foundation.errors import NondeterminismError, ReadOnlyError
 from tcmrl_data.foundation.plain_files import folder_problem
 from tcmrl_data.parts.making import Published, numbered, read_published
 from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.manifest import dataset_folder, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, dataset_folder, read_manifest, restore_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification.findings import Finding, VerifyLevel
@@ -40,7 +40,7 @@ class RepairReport:
 
     Attributes:
         repaired: keys of the parts that were made again, with the ids that they had.
-        tables: tables that were written again from the parts.
+        tables: tables that were written again from the parts, and the manifest if it was, from its copy.
         left: findings that a repair leaves to people: foreign files, and values of the manifest.
         failed: one line per task that could not be made again; the dataset is then as it was.
         read_only: the folder cannot be written, and nothing had to be.
@@ -75,15 +75,16 @@ def repair_dataset(
         progress: called with the events of the build.
 
     Raises:
-        ManifestError: the manifest itself is damaged. Delete it and the parts that `verify` names, then build
-            with the options of the first build, which keeps the sound parts.
+        ManifestError: the manifest and its copy are damaged. Delete both and the parts that `verify` names,
+            then build with the options of the first build, which keeps the sound parts.
         BuildError: the tables are damaged and the parts do not have the manifest's root.
         LockedError: another process works on the dataset.
         ReadOnlyError: the folder cannot be written, and something is damaged.
         NondeterminismError: a part came out with another id; nothing was replaced.
     """
     folder = dataset_folder(path)
-    read_manifest(folder)
+    if not (folder / MANIFEST_COPY).exists():
+        read_manifest(folder)
     check_work_files(folder, but=(TASKS, PARTS_TABLE))
     try:
         return _repair(folder, level=level, workers=workers, progress=progress)
@@ -103,6 +104,7 @@ def _repair(
 ) -> RepairReport:
     with lock_file(folder / LOCK, f"dataset {folder}"):
         remove_abandoned(folder)
+        restored = (MANIFEST,) if restore_manifest(folder) else ()
         findings = find_problems(folder, level)
         damaged = sorted({finding.file for finding in findings if not finding.foreign} & {TASKS, PARTS_TABLE})
         if damaged:
@@ -114,7 +116,8 @@ def _repair(
             failed = _replace_parts(folder, keys, workers, progress)
         remove_tree(folder / STAGING / REPAIR)
         left = find_problems(folder, level)
-    return RepairReport(folder, () if failed else keys, tuple(damaged), left, failed, read_only=False)
+    tables = (*restored, *damaged)
+    return RepairReport(folder, () if failed else keys, tables, left, failed, read_only=False)
 
 
 def _replace_parts(

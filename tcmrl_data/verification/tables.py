@@ -12,7 +12,7 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.parts.making import Published, numbered, read_published
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.keys import PartKey, key_of_file, part_file
-from tcmrl_data.store.manifest import MANIFEST, Manifest
+from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, Manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_entries, parse_parts
 from tcmrl_data.store.platform import Platform
 from tcmrl_data.store.sealing import write_dataset
@@ -41,7 +41,8 @@ def restore_tables(folder: Path, manifest: Manifest) -> None:
     if len(tasks) != manifest.tasks.lines or table.without_tasks(manifest.dropped).root != manifest.root:
         raise BuildError(
             f"{folder}: its tables are damaged, and what its parts tell does not have the manifest's root; "
-            f"delete {MANIFEST} and run the first `tcmrl-data build` again, which keeps the sound parts"
+            f"delete {MANIFEST} and {MANIFEST_COPY} and run the first `tcmrl-data build` again, which keeps "
+            "the sound parts"
         )
     write_tables(folder, manifest, tasks=tasks, table=table, platforms=platforms)
 

@@ -22,7 +22,14 @@ from tcmrl_data.foundation.plain_files import file_problem, words_after
 from tcmrl_data.parts.operation import can_be_made_again
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PARTS, key_of_file, part_file
-from tcmrl_data.store.manifest import MANIFEST, Manifest, dataset_folder, read_manifest
+from tcmrl_data.store.manifest import (
+    MANIFEST,
+    MANIFEST_COPY,
+    Manifest,
+    copy_problem,
+    dataset_folder,
+    read_manifest,
+)
 from tcmrl_data.store.part_record import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry
 from tcmrl_data.store.task_table import TASKS
@@ -164,6 +171,8 @@ class _Verification:
             table, runs = self._description.table, {run.name: run for run in manifest.runs}
             for file, problem in derived_problems(self._folder, table, runs, bad=bad):
                 self._add(file, problem)
+        if (problem := copy_problem(self._folder)) and not self._is_written:
+            self._add(MANIFEST_COPY, problem)
         self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *DESCRIPTIONS, *entries, *unnamed})
         return len(entries)
 

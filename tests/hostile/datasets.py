@@ -16,10 +16,11 @@ from safetensors.numpy import load, save
 from tcmrl_data import BuildReport, open_dataset
 from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
 from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays, read_arrays
 from tcmrl_data.store.keys import PARTS, PartKey, part_file
-from tcmrl_data.store.manifest import MANIFEST, seal
+from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part_record import RECORD
 from tcmrl_data.store.part_table import (
     HEADER,
@@ -96,7 +97,7 @@ class Forge:
         values = json.loads(file.read_bytes())
         change(values)
         values.pop("digest", None)
-        file.write_bytes(seal(values))
+        file.write_bytes(sealed(values))
 
     def text(self, old: bytes, new: bytes, file: str = MANIFEST) -> None:
         """Changes a file's bytes and no digest."""

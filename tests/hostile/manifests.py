@@ -30,15 +30,15 @@ MANIFESTS = [
     ),
     _manifest("no UTF-8", lambda f: f.text(b'"seed":0', b'"seed":"\xff"'), "utf-8"),
     _manifest("byte order mark", lambda f: f.text(b"{", b"\xef\xbb\xbf{"), "not a manifest"),
-    _manifest("surrogate", lambda f: f.text(b'"seed":0', b'"seed":"\\ud800"'), "seed holds control"),
+    _manifest("surrogate", with_run(seed="\ud800"), "seed holds control"),
     _manifest("extreme depth", _manifest_file(b"[" * 10**5), "nested deeper"),
     _manifest("extreme size", _manifest_file(b" " * (20 * 2**20)), "bytes"),
     _manifest("too many values", _manifest_file(b"[" + b"[]," * 200_000 + b"[]]"), "values"),
     _manifest(
         "many values", _manifest_file(b'{"schema_version":2,"x":[' + b"[]," * 60_000 + b"0]}"), "digest"
     ),
-    _manifest("40000 bad runs", lambda f: f.text(b'"runs":[', b'"runs":[' + b"{}," * 40_000), "runs"),
-    _manifest("900 bad runs", lambda f: f.text(b'"runs":[', b'"runs":[' + b"{}," * 900), "runs.0"),
+    _manifest("40000 bad runs", with_field(runs=[{}] * 40_000), "runs"),
+    _manifest("900 bad runs", with_field(runs=[{}] * 900), "runs.0"),
     _manifest(
         "two runs of one name", lambda f: f.manifest(lambda v: v["runs"].append(v["runs"][0])), "names"
     ),
