@@ -171,8 +171,9 @@ class _Verification:
             table, runs = self._description.table, {run.name: run for run in manifest.runs}
             for file, problem in derived_problems(self._folder, table, runs, bad=bad):
                 self._add(file, problem)
-        if (problem := copy_problem(self._folder)) and not self._is_written:
-            self._add(MANIFEST_COPY, problem)
+        of_copy = copy_problem(self._folder)
+        if of_copy and not self._is_written:
+            self._add(MANIFEST_COPY, of_copy)
         self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *DESCRIPTIONS, *entries, *unnamed})
         return len(entries)
 
