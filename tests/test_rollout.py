@@ -14,7 +14,7 @@ from tcmrl_data import (
     load_recipe,
     roll_out,
 )
-from tcmrl_data.envs.base import Environment, EnvironmentLanes, LaneStep
+from tcmrl_data.envs.base import Environment, LaneStep
 from tcmrl_data.envs.controller import View
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 from tests.environments import environment_of, parameters_of
@@ -159,17 +159,6 @@ def test_episodes_do_not_depend_on_their_neighbours(environment: Environment) ->
     alone = roll(environment, environment.lanes(tasks[:1]), UniformController())
     assert np.array_equal(together[0].observations, alone[0].observations)
     assert not np.array_equal(together[0].actions, together[1].actions)
-
-
-def test_the_numpy_batch_equals_single_environments(environment: Environment) -> None:
-    tasks = [{"goal": [0.0, 1.0], "wind": [0.02, 0.0]}, {"goal": [1.0, 0.0], "wind": [0.01, -0.03]}]
-    batch = roll(environment, environment.lanes(tasks), UniformController())
-    one_by_one = EnvironmentLanes(environment, [environment.make(task, view="full") for task in tasks])
-    single = roll(environment, one_by_one, UniformController())
-    for left, right in zip(batch, single, strict=True):
-        assert np.array_equal(left.observations, right.observations)
-        assert np.array_equal(left.rewards, right.rewards)
-        assert np.array_equal(left.truncated, right.truncated)
 
 
 def test_lanes_can_be_used_again(environment: Environment) -> None:

@@ -16,7 +16,7 @@ from tcmrl_data import Recipe, load_recipe, open_dataset
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.behavior.stacked import StackedSettings, StackedSource
+from tcmrl_data.behavior.stacked import StackedSource
 from tcmrl_data.behavior.stacked_training import GroupTraining
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.plan import BuildPlan, plan_build
@@ -53,25 +53,21 @@ def recipe_of(name: str = "point-robot-wind", overrides: Sequence[str] = TINY) -
     return load_recipe(name, profile="quick", overrides=overrides, behavior="stacked")
 
 
-def source_of(recipe: Recipe) -> StackedSource:
-    return StackedSource(settings_of(recipe))
-
-
-def settings_of(recipe: Recipe) -> StackedSettings:
-    return StackedSettings.model_validate_json(canonical_json(recipe.behavior.settings))
+def training_of(tasks: Sequence[int], folder: Path) -> GroupTraining:
+    source = recipe_of().make_source()
+    assert isinstance(source, StackedSource)
+    return GroupTraining(context_of(recipe_of(), tasks, folder), source.settings)
 
 
 def snapshots_of(recipe: Recipe, context: BehaviorContext) -> dict[tuple[int, int], Snapshot]:
-    return {(task.index, snapshot.step): snapshot for task, snapshot in source_of(recipe).snapshots(context)}
+    return {
+        (task.index, snapshot.step): snapshot for task, snapshot in recipe.make_source().snapshots(context)
+    }
 
 
 def test_what_a_task_draws_and_learns_does_not_depend_on_its_group(tmp_path: Path) -> None:
     """Replay rows of the warm-up and batch positions are equal; the policies differ by rounding at most."""
-    recipe = recipe_of()
-    alone, together = (
-        GroupTraining(context_of(recipe, tasks, tmp_path), settings_of(recipe))
-        for tasks in ([3], [0, 2, 3, 7])
-    )
+    alone, together = training_of([3], tmp_path), training_of([0, 2, 3, 7], tmp_path)
     for training in (alone, together):
         for _ in range(50):
             training.advance()
@@ -246,7 +242,7 @@ def test_a_diverged_agent_is_named_and_the_others_are_kept(tmp_path: Path) -> No
     found: dict[tuple[int, int], Snapshot] = {}
     context = context_of(recipe, [1, 2, 3], tmp_path)
     pairs = (
-        ((task.index, snapshot.step), snapshot) for task, snapshot in source_of(recipe).snapshots(context)
+        ((task.index, snapshot.step), snapshot) for task, snapshot in recipe.make_source().snapshots(context)
     )
     with pytest.raises(BuildError, match=r"diverged: task 2 by step 130; use a smaller"):
         found.update(pairs)
@@ -291,12 +287,11 @@ def test_the_others_of_a_diverged_agents_group_go_on_from_their_checkpoint(
 
 @pytest.mark.usefixtures("poisoned")
 def test_a_diverged_agent_reaches_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    recipe = recipe_of()
-    ill = GroupTraining(context_of(recipe, [1, 2, 3], tmp_path), settings_of(recipe))
+    ill = training_of([1, 2, 3], tmp_path)
     for _ in range(130):
         ill.advance()
     monkeypatch.undo()
-    healthy = GroupTraining(context_of(recipe, [1, 2, 3], tmp_path), settings_of(recipe))
+    healthy = training_of([1, 2, 3], tmp_path)
     for _ in range(130):
         healthy.advance()
     assert [ill.snapshot(agent).digest() == healthy.snapshot(agent).digest() for agent in range(3)] == [
@@ -308,12 +303,12 @@ def test_a_diverged_agent_reaches_no_other(tmp_path: Path, monkeypatch: pytest.M
 
 def test_reduced_precision_is_recorded_with_its_error_and_left_behind_at_once(tmp_path: Path) -> None:
     recipe = recipe_of(overrides=(*TINY, "behavior.stacked.matmul_precision=medium"))
-    assert source_of(recipe_of()).provenance() == {}
+    assert recipe_of().make_source().provenance() == {}
     tcmrl_data.build_dataset(recipe, tmp_path / "dataset", tasks=[1, 2], workers=1)
     recorded = open_dataset(tmp_path / "dataset").part(1, 130).behavior
     assert recorded["matmul_precision"] == "medium"
     assert 0 < recorded["matmul_error"] < 0.05  # of a product's standard deviation; bfloat16 gives 0.013
-    snapshots = source_of(recipe).snapshots(context_of(recipe, [1, 2], tmp_path))
+    snapshots = recipe.make_source().snapshots(context_of(recipe, [1, 2], tmp_path))
     assert {torch.get_float32_matmul_precision() for _ in snapshots} == {"highest"}
 
 

@@ -104,12 +104,7 @@ class EnvironmentSettings(BaseModel):
 class LaneStep:
     """One step of all lanes; rows of inactive lanes repeat the last observation and have reward zero.
 
-    Attributes:
-        observations: (lanes, observation_dim), full view.
-        rewards: (lanes,).
-        terminated: (lanes,) bool.
-        truncated: (lanes,) bool.
-        extras: the environment's extra arrays by name, all of shape (lanes,).
+    Observations are (lanes, observation_dim) in the full view; all others are (lanes,), extra arrays by name.
     """
 
     observations: FloatArray
