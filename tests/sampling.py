@@ -22,7 +22,8 @@ def rows_of(tasks: Sequence[Sequence[Trajectory]]) -> PackedRows:
     for task, count in zip(tasks, counts, strict=True):
         lengths.append(fill_rows(table[start : start + count], pack(task)))
         start += count
-    episodes = Episodes.of(lengths, range(len(tasks)))
+    owners = np.repeat(np.arange(len(tasks)), [len(task) for task in tasks])
+    episodes = Episodes.of(np.concatenate(lengths), owners)
     return PackedRows(table, episodes, observation_dim, action_dim, np.arange(len(tasks)))
 
 

@@ -1,5 +1,6 @@
 """The cache of decoded steps: equal rows, eviction, torn entries, and memory during decoding."""
 
+import errno
 import json
 import os
 import shutil
@@ -29,11 +30,9 @@ from tcmrl_data import (
 from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
 from tcmrl_data.foundation.errors import CacheError, ManifestError, StoreError
 from tcmrl_data.foundation.records import sealed
-from tcmrl_data.sampling import cache, cache_entry
-from tcmrl_data.sampling.cache import cached_rows, load_rows
-from tcmrl_data.sampling.cache_entry import RECORD_BYTES
-from tcmrl_data.sampling.cache_table import TableSeal, write_table
-from tcmrl_data.sampling.rows import Indices, PartRows, Table, read_rows
+from tcmrl_data.sampling import cache
+from tcmrl_data.sampling.cache import RECORD_BYTES, cached_rows, load_rows
+from tcmrl_data.sampling.rows import Indices, PartRows, Table, fill_table, read_rows
 from tcmrl_data.store.archive import pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays
 from tcmrl_data.store.keys import PartKey
@@ -150,16 +149,12 @@ def forge(copy: Path, *, claim: str) -> Path:
 
 @pytest.mark.parametrize(
     ("file", "damage"),
-    [
-        *(
-            (file, damage)
-            for file in ("record.json", "episodes.i64", "blocks.bin", "rows.f32")
-            for damage in ("cut", "missing", "flipped")
-        )
-    ],
+    [*((file, damage) for file in ("record.json", "rows.bin") for damage in ("cut", "missing", "flipped"))],
 )
 def test_a_torn_entry_is_made_again(selection: Selection, folder: Path, file: str, damage: str) -> None:
-    expected = np.array(cached_rows(selection).table)
+    rows = cached_rows(selection)
+    expected, lengths = np.array(rows.table), rows.episodes.lengths
+    del rows
     (entry,) = entries(folder)
     content = (entry / file).read_bytes()
     if damage == "missing":
@@ -167,21 +162,23 @@ def test_a_torn_entry_is_made_again(selection: Selection, folder: Path, file: st
     else:
         flipped = content[:-9] + bytes([content[-9] ^ 1]) + content[-8:]
         (entry / file).write_bytes(content[:-4] if damage == "cut" else flipped)
-    np.testing.assert_array_equal(cached_rows(selection).table, expected)
-    if file != "record.json":  # it holds the number and the time of the new table's file
+    again = cached_rows(selection)
+    np.testing.assert_array_equal(again.table, expected)
+    np.testing.assert_array_equal(again.episodes.lengths, lengths)
+    if file != "record.json":  # it holds the time of the new file
         assert (entries(folder)[0] / file).read_bytes() == content
 
 
-def test_a_large_table_that_was_changed_is_hashed(
+def test_a_large_file_that_was_changed_is_hashed(
     selection: Selection, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One byte in its padding, with the old time of writing; a table that was not changed is not hashed."""
-    monkeypatch.setattr(cache_entry, "CHECKED_BYTES", 0)
+    """One byte of a length, with the old time of writing; a file that was not changed is not hashed."""
+    monkeypatch.setattr(cache, "CHECKED_BYTES", 0)
     cached_rows(selection)
-    table = entries(folder)[0] / "rows.f32"
+    table = entries(folder)[0] / "rows.bin"
     before = table.stat()
     with monkeypatch.context() as patch:
-        patch.setattr(cache_entry, "table_problem", lambda file, blocks: pytest.fail("hashed"))
+        patch.setattr(cache, "_digest_of", lambda file: pytest.fail("hashed"))
         cached_rows(selection)
     with table.open("r+b") as file:
         file.seek(-1, os.SEEK_END)
@@ -245,9 +242,11 @@ def test_what_was_used_longest_ago_goes_first(tiny: Dataset, monkeypatch: pytest
 
 
 def test_a_disk_without_room_is_refused(selection: Selection, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage = type("Usage", (), {"free": 10})
-    monkeypatch.setattr("tcmrl_data.sampling.cache_room.shutil.disk_usage", lambda path: usage)
-    with pytest.raises(CacheError, match="TCMRL_CACHE"):
+    def refuse(descriptor: int, first: int, size: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "posix_fallocate", refuse)
+    with pytest.raises(CacheError, match=r"No space left on device.*set TCMRL_CACHE to a folder"):
         cached_rows(selection)
 
 
@@ -260,7 +259,7 @@ def test_a_damaged_part_leaves_no_entry(tiny_copy: Callable[[], Path], folder: P
     with pytest.raises(StoreError, match=r"rewards/c/0.*repair"):
         cached_rows(dataset.select())
     assert not (folder / "rows").exists() or not entries(folder)
-    assert not [path for path in (folder / ".staging").iterdir() if path.suffix != ".lock"]
+    assert not (folder / ".staging").exists()
 
 
 def test_decoding_takes_the_memory_of_the_parts_at_work(
@@ -273,14 +272,15 @@ def test_decoding_takes_the_memory_of_the_parts_at_work(
         return np.array([len(out) - 1])
 
     monkeypatch.setattr("tcmrl_data.sampling.rows.READERS", 1)
-    monkeypatch.setattr("tcmrl_data.sampling.cache_table.read_part", fill)
+    monkeypatch.setattr("tcmrl_data.sampling.rows.read_part", fill)
     rows = 2**18 // 8
     plan = [PartRows(tiny, PartKey(0, i), 0, rows * i, rows * (i + 1), 1) for i in range(40)]
-    (tmp_path / "rows").touch()
     tracemalloc.start()
-    write_table(tmp_path / "rows", plan, (40 * rows, 8))
+    mapped: Table = np.memmap(tmp_path / "rows", dtype=np.float32, mode="w+", shape=(40 * rows, 8))
+    fill_table(mapped, plan, check_digests=True)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
+    del mapped
     assert peak < 3 * 2**20
     table = np.fromfile(tmp_path / "rows", dtype=np.float32).reshape(40, -1)
     assert (table == np.arange(40)[:, None] * rows).all()
@@ -319,21 +319,23 @@ def test_verify_finds_what_the_disk_damaged_and_opening_does_not(
     selection: Selection, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Damage of the disk changes no time; here the record says that the damaged file is the sealed one."""
-    monkeypatch.setattr(cache_entry, "CHECKED_BYTES", 0)
+    monkeypatch.setattr(cache, "CHECKED_BYTES", 0)
     call: Call = in_process(data, capsys)
     rows = cached_rows(selection)
     (entry,) = entries(folder)
     assert json.loads(call("cache", "verify", "--json")[1]) == {"checked": 1, "damaged": []}
-    content = bytearray((entry / "rows.f32").read_bytes())
+    content = bytearray((entry / "rows.bin").read_bytes())
     content[0] ^= 1
-    (entry / "rows.f32").write_bytes(content)
-    record = json.loads((entry / "record.json").read_bytes().partition(b"\n")[2])
-    record["seal"] = TableSeal.of(entry / "rows.f32").model_dump()
-    text = canonical_json(record)
-    (entry / "record.json").write_bytes(sha256(text).encode() + b"\n" + text)
-    assert cached_rows(selection).table.tobytes() == content
+    (entry / "rows.bin").write_bytes(content)
+    record = json.loads((entry / "record.json").read_bytes())
+    record["changed"] = (entry / "rows.bin").stat().st_ctime_ns
+    (entry / "record.json").write_text(json.dumps(record))
+    assert content.startswith(cached_rows(selection).table.tobytes())
     code, output, errors = call("cache", "verify")
-    assert code == 1 and "rows.f32 are not those that were written; kept, because it is in use" in output
+    assert (
+        code == 1
+        and "the bytes of rows.bin are not those that were written; kept, because it is in use" in output
+    )
     assert errors == "Error: 1 of 1 entries are damaged\n"
     del rows
     damaged = json.loads(call("cache", "verify", "--json")[1])["damaged"]

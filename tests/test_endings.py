@@ -74,7 +74,7 @@ def test_endings_of_ragged_episodes_are_those_computed_by_hand(
     chunk_rows: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Episodes of 0, 1, 2 and 3 steps, terminated and truncated, in chunks of any size."""
-    monkeypatch.setattr("tcmrl_data.sampling.endings.CHUNK_ROWS", chunk_rows)
+    monkeypatch.setattr("tcmrl_data.sampling.gather.CHUNK_ROWS", chunk_rows)
     sampler = sampler_of([RAGGED] * 2, REQUEST)
     drawn = set()
     for n in range(10):

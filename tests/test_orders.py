@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tcmrl_data.sampling.orders import fill_places, places_filled, read_end
+from tcmrl_data.sampling.draws import fill_places, places_filled, read_end
 
 
 @given(st.lists(st.integers(1, 9), min_size=1, max_size=4), st.data())

@@ -10,7 +10,7 @@ from tests.workers import wait_for
 
 
 def threads() -> int:
-    return sum(thread.name == "prefetch" for thread in threading.enumerate())
+    return sum(thread.name.startswith("prefetch") for thread in threading.enumerate())
 
 
 @pytest.mark.parametrize("depth", [0, 1, 2, 7])

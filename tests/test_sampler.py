@@ -244,7 +244,7 @@ def test_resuming_at_n_gives_the_batches_of_an_uninterrupted_run(n: int) -> None
 @settings(deadline=None, max_examples=30)
 def test_moments_equal_those_of_the_flat_data(chunk_rows: int, episodes: list[list[Trajectory]]) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("tcmrl_data.sampling.moments.CHUNK_ROWS", chunk_rows)
+        patch.setattr("tcmrl_data.sampling.rows.CHUNK_ROWS", chunk_rows)
         found = sampler_of(episodes, BatchRequest(tasks=2, kinds={})).moments()
     flat = [episode for task in episodes for episode in task]
     observations = np.concatenate([episode.observations[:-1] for episode in flat]).astype(np.float64)

@@ -1,45 +1,126 @@
-"""The cache of decoded steps, for selections that do not fit into memory; read through the page cache.
+"""The cache of decoded steps, for selections that do not fit into memory.
 
 An entry is a folder `<cache>/rows/<key>`; its key is a digest of the selected parts' ids, and every array is
 checked against its part's record while it is decoded, so that a forged dataset cannot take the place of
-another. All entries, those being written included, stay below TCMRL_CACHE_LIMIT: the least recently used
-entry that is not in use is evicted. Of several processes that need the same entry, one decodes, others wait.
+another. `rows.bin` holds the table of packed rows, which is mapped into memory, and behind it the length of
+every episode. `record.json` holds the file's digest. An entry is written once, forced to disk, published by
+one rename, and never changes.
+
+One process writes at a time, under the cache's lock; others wait. Before it writes, the least recently used
+entries are removed until all fit below TCMRL_CACHE_LIMIT. A reader holds a shared lock on its entry's record,
+so that no entry in use is removed.
+
+A file of up to CHECKED_BYTES is hashed whenever it is opened, and so is every file that changed since it was
+written. `tcmrl-data cache verify` hashes all. Nothing here guards against a person who may write to the
+cache's folder and forges a whole entry: give write access only to those who are trusted.
 """
 
 import contextlib
+import hashlib
 import os
+import time
+import weakref
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from tcmrl_data.foundation.errors import CacheError, StorageError
-from tcmrl_data.foundation.locks import take_shared_lock
-from tcmrl_data.foundation.machine import available_memory, parse_bytes, size
-from tcmrl_data.sampling.cache_entry import (
-    RECORD,
-    entry_bytes,
-    entry_key,
-    entry_problem,
-    open_entry,
-    read_entry,
-    write_entry,
+import numpy as np
+from pydantic import ValidationError
+
+from tcmrl_data.foundation.canonical import digest
+from tcmrl_data.foundation.disk import (
+    LOCK,
+    STAGING,
+    disk,
+    is_current,
+    lock_file,
+    make_folders,
+    move_into_place,
+    remove_tree,
+    write_file,
 )
-from tcmrl_data.sampling.cache_room import (
-    CacheEntry,
-    entries,
-    entry_folder,
-    evict,
-    only_writer,
-    publish,
-    reserve,
+from tcmrl_data.foundation.errors import CacheError, LockedError, StorageError
+from tcmrl_data.foundation.locks import is_locked, take_shared_lock, try_exclusive_lock
+from tcmrl_data.foundation.machine import available_cores, available_memory, parse_bytes, size
+from tcmrl_data.foundation.plain_files import one_line, printable
+from tcmrl_data.foundation.records import Record, record_bytes
+from tcmrl_data.sampling.rows import (
+    READERS,
+    PackedRows,
+    Table,
+    fill_table,
+    pack_rows,
+    plan_rows,
+    read_rows,
+    row_arrays,
+    table_shape,
 )
-from tcmrl_data.sampling.rows import PackedRows, plan_rows, read_rows, table_shape
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.selection import Selection
 
 CACHE_BYTES = 100 * 10**9
 """Default of TCMRL_CACHE_LIMIT, the maximum size of all entries."""
+
+CHECKED_BYTES = 10**9
+"""A file up to this size is hashed whenever it is opened, which takes about a second on one core."""
+
+FORMAT = 3
+"""Part of every key; increased when the layout of an entry changes."""
+
+RECORD_BYTES = 2**13
+"""More than a record takes."""
+
+PIECE_BYTES = 2**22
+"""Files are hashed in pieces of this size, several at a time."""
+
+WAIT_SECONDS = 0.2
+"""Interval at which a process that waits for the lock tries again."""
+
+ROWS, RECORD = "rows.bin", "record.json"
+
+
+@dataclass(frozen=True)
+class CacheEntry:
+    """An entry of the cache.
+
+    Attributes:
+        key: name of its folder.
+        environment: name of the dataset's environment; empty if the entry is damaged.
+        dataset: folder that it was decoded from; equal parts elsewhere share the entry. Empty if damaged.
+        tasks: number of selected tasks.
+        parts: number of selected parts.
+        bytes: size on disk.
+        used: Unix time of the last use.
+        in_use: True if a process reads the entry.
+    """
+
+    key: str
+    environment: str
+    dataset: str
+    tasks: int
+    parts: int
+    bytes: int
+    used: float
+    in_use: bool
+
+
+class EntryRecord(Record):
+    """The file `record.json` of an entry.
+
+    Attributes:
+        changed: time of the last change of `rows.bin` in nanoseconds (ctime), which no program can set back.
+        digest: of `rows.bin`; see `_digest_of`.
+    """
+
+    environment: str
+    dataset: str
+    tasks: int
+    parts: int
+    changed: int
+    digest: str
 
 
 def cache_folder() -> Path:
@@ -48,12 +129,22 @@ def cache_folder() -> Path:
     return Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tcmrl"
 
 
+def cache_limit() -> int:
+    """The maximum size of all entries in bytes: TCMRL_CACHE_LIMIT (such as `20G`), or 100 GB.
+
+    Raises:
+        CacheError: the variable is not a valid size.
+    """
+    text = os.environ.get("TCMRL_CACHE_LIMIT")
+    return parse_bytes(text) if text else CACHE_BYTES
+
+
 def load_rows(
     selection: "Selection",
     *,
     dense: bool = False,
     memory_limit: int | None = None,
-    say: Callable[[str], None] = lambda message: None,
+    say: Callable[[str], None] | None = None,
 ) -> PackedRows:
     """Loads the rows of a selection into memory, or from the cache if they do not fit.
 
@@ -68,22 +159,23 @@ def load_rows(
         SelectionError: a part has no dense rewards.
         StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
     """
-    needed = _table_bytes(selection, dense)
+    rows, width = table_shape(selection, plan_rows(selection, dense=dense))
+    needed = 4 * rows * width
     limit = available_memory() // 2 if memory_limit is None else memory_limit
     if needed <= limit:
         return read_rows(selection, dense=dense)
-    why = "half of the available memory" if memory_limit is None else "the memory limit"
-    say(f"{size(needed)} of steps exceed {why}, {size(limit)}: using the cache")
+    if say:
+        why = "half of the available memory" if memory_limit is None else "the memory limit"
+        say(f"{size(needed)} of steps exceed {why}, {size(limit)}: using the cache")
     return cached_rows(selection, dense=dense, say=say)
 
 
 def cached_rows(
-    selection: "Selection", *, dense: bool = False, say: Callable[[str], None] = lambda message: None
+    selection: "Selection", *, dense: bool = False, say: Callable[[str], None] | None = None
 ) -> PackedRows:
     """Opens the rows of a selection from the cache; decodes them into the cache if they are not there.
 
-    If another process decodes them, this one waits; it decodes them itself if the other ends before.
-    The entry is locked against eviction while its table is in use.
+    If another process decodes, this one waits; it decodes the rows itself if the other ends before.
 
     Args:
         selection: the selection.
@@ -96,26 +188,164 @@ def cached_rows(
         StoreError: arrays cannot be decoded, do not form episodes, or are not those that the part's record
             names; the message names the part.
     """
-    folder, key = cache_folder(), entry_key(selection, dense=dense)
-    entry = entry_folder(folder, key)
+    folder = cache_folder()
+    entry = folder / "rows" / entry_key(selection, dense=dense)
     with _named_cache(folder):
-        rows = open_entry(entry, selection)
+        rows = _open_entry(entry, selection, dense)
         if rows is not None:
             return rows
-        with only_writer(folder, key, say):
-            rows = open_entry(entry, selection)  # another process may have decoded it meanwhile
+        make_folders(folder)
+        with _writer_lock(folder, say):
+            rows = _open_entry(entry, selection, dense)  # another process may have decoded it meanwhile
             if rows is None:
-                say(f"decoding {selection.dataset.folder} into {entry}; this happens once")
-                needed = entry_bytes(selection, dense=dense)
-                staged = reserve(folder, key, needed=needed, limit=cache_limit())
-                rows = write_entry(staged, selection, dense=dense)
-                publish(folder, key)
-            return rows
+                if say:
+                    say(f"decoding {selection.dataset.folder} into {entry}; this happens once")
+                _write_entry(folder, entry, selection, dense)
+                rows = _open_entry(entry, selection, dense)
+    if rows is None:
+        raise CacheError(f"{entry} changed while it was written; run the same command again")
+    return rows
+
+
+def entry_key(selection: "Selection", *, dense: bool = False) -> str:
+    """The name of a selection's entry: a digest of what its rows hold, whatever the dataset claims.
+
+    A part's id is the digest of its identity, which holds the sha256 of every decoded array. Decoding checks
+    both, so that an entry holds what its key says.
+    """
+    dataset = selection.dataset
+    parts = [
+        (key.task, key.step, dataset.entry(key).id)
+        for task in selection.tasks
+        for key in selection.parts[task.index]
+    ]
+    environment = dataset.environment
+    layout = (*row_arrays(dense), environment.observation_dim, environment.action_dim)
+    return digest({"format": FORMAT, "layout": layout, "parts": parts})[:32]
+
+
+def entry_bytes(selection: "Selection", *, dense: bool = False) -> int:
+    """The most that a selection's entry takes on disk, in bytes."""
+    plan = plan_rows(selection, dense=dense)
+    rows, width = table_shape(selection, plan)
+    return 4 * rows * width + 8 * sum(part.episodes for part in plan) + RECORD_BYTES
+
+
+def _open_entry(entry: Path, selection: "Selection", dense: bool) -> PackedRows | None:
+    """The rows of an entry, which is locked while its table is in use; None if it is missing or damaged."""
+    with contextlib.ExitStack() as lock:
+        try:
+            file = lock.enter_context((entry / RECORD).open("rb"))
+        except FileNotFoundError:
+            return None
+        take_shared_lock(file)  # whoever removes an entry holds the exclusive lock only briefly
+        if not is_current(file, entry / RECORD) or _problem(entry, limit=CHECKED_BYTES):
+            return None
+        with contextlib.suppress(OSError):  # a cache that may only be read
+            os.utime(entry / RECORD)
+        plan = plan_rows(selection, dense=dense)
+        shape = table_shape(selection, plan)
+        # copy on write, because torch requires writable memory and the file must not change
+        table: Table = np.memmap(entry / ROWS, dtype=np.float32, mode="c", shape=shape)
+        lengths = np.fromfile(entry / ROWS, dtype=np.int64, offset=table.nbytes)
+        weakref.finalize(table, lock.pop_all().close)
+        return pack_rows(selection, plan, table, lengths)
+
+
+def _write_entry(folder: Path, entry: Path, selection: "Selection", dense: bool) -> None:
+    """Decodes a selection part by part into a staged folder, and publishes it; called by the only writer."""
+    if entry.is_dir() and not _remove(entry):
+        raise CacheError(
+            f"{entry} is damaged, and another process reads it; stop that process, then run the same command "
+            "again"
+        )
+    remove_tree(folder / STAGING)  # what a killed process left
+    _make_room(folder, entry_bytes(selection, dense=dense))
+    staged = folder / STAGING / entry.name
+    make_folders(staged)
+    make_folders(entry.parent)
+    try:
+        plan = plan_rows(selection, dense=dense)
+        shape = table_shape(selection, plan)
+        with (staged / ROWS).open("xb") as file:  # reserves blocks: in the map, a full disk ends the process
+            os.posix_fallocate(file.fileno(), 0, 4 * shape[0] * shape[1])
+        lengths = fill_table(
+            np.memmap(staged / ROWS, dtype=np.float32, mode="r+", shape=shape), plan, check_digests=True
+        )
+        with (staged / ROWS).open("ab") as file:
+            file.write(lengths.tobytes())
+        disk.sync(staged / ROWS)
+        record = EntryRecord(
+            environment=selection.dataset.name,
+            dataset=printable(str(selection.dataset.folder.resolve())),
+            tasks=len(selection.tasks),
+            parts=len(plan),
+            changed=(staged / ROWS).stat().st_ctime_ns,
+            digest=_digest_of(staged / ROWS),
+        )
+        write_file(staged / RECORD, record_bytes(record))
+        disk.sync(staged)
+        move_into_place(staged, entry)
+    finally:
+        remove_tree(folder / STAGING)
+
+
+def _read_record(entry: Path) -> EntryRecord | None:
+    """An entry's record; None if it is missing, damaged, or of another format."""
+    try:
+        return EntryRecord.model_validate_json((entry / RECORD).read_bytes())
+    except (FileNotFoundError, ValidationError):
+        return None
+
+
+def _problem(entry: Path, *, limit: int | None = None) -> str | None:
+    """Why an entry is damaged, in words; None if nothing is found.
+
+    Args:
+        entry: its folder.
+        limit: a file above this size, in bytes, is not hashed unless it changed; None hashes every file.
+    """
+    record = _read_record(entry)
+    if record is None:
+        return f"{RECORD} is damaged, or of another version"
+    try:
+        status = (entry / ROWS).stat()
+        if limit is not None and status.st_size > limit and status.st_ctime_ns == record.changed:
+            return None
+        is_same = _digest_of(entry / ROWS) == record.digest
+    except OSError as error:
+        return f"{ROWS} cannot be read ({one_line(error)})"
+    return None if is_same else f"the bytes of {ROWS} are not those that were written"
+
+
+def _digest_of(file: Path) -> str:
+    """The sha256 of the sha256 of a file's pieces, which several threads hash."""
+    with file.open("rb", buffering=0) as data, ThreadPoolExecutor(min(READERS, available_cores())) as pool:
+        descriptor = data.fileno()
+
+        def hash_piece(start: int) -> bytes:
+            return hashlib.sha256(os.pread(descriptor, PIECE_BYTES, start)).digest()
+
+        pieces = pool.map(hash_piece, range(0, os.fstat(descriptor).st_size, PIECE_BYTES))
+        return hashlib.sha256(b"".join(pieces)).hexdigest()
 
 
 def list_cache() -> tuple[CacheEntry, ...]:
     """The entries of the cache, least recently used first."""
-    return tuple(entries(cache_folder()))
+    found = []
+    for entry in sorted((cache_folder() / "rows").glob("*/")):
+        with contextlib.suppress(FileNotFoundError):  # removed meanwhile
+            found.append(_look_at(entry))
+    return tuple(sorted(found, key=lambda entry: entry.used))
+
+
+def _look_at(entry: Path) -> CacheEntry:
+    record, used, in_use = _read_record(entry), entry.stat().st_mtime, False
+    if (entry / RECORD).is_file():
+        with (entry / RECORD).open("rb") as file:
+            used, in_use = os.fstat(file.fileno()).st_mtime, is_locked(file)
+    about = (record.environment, record.dataset, record.tasks, record.parts) if record else ("", "", 0, 0)
+    return CacheEntry(entry.name, *about, sum(path.stat().st_size for path in entry.iterdir()), used, in_use)
 
 
 def clear_cache() -> tuple[CacheEntry, ...]:
@@ -124,7 +354,8 @@ def clear_cache() -> tuple[CacheEntry, ...]:
     Raises:
         CacheError: the cache's folder cannot be written.
     """
-    return _remove(list_cache())
+    with _named_cache(cache_folder()):
+        return tuple(entry for entry in list_cache() if _remove(cache_folder() / "rows" / entry.key))
 
 
 def verify_cache() -> tuple[tuple[CacheEntry, str], ...]:
@@ -136,40 +367,65 @@ def verify_cache() -> tuple[tuple[CacheEntry, str], ...]:
     Raises:
         CacheError: a damaged entry cannot be removed, because the cache's folder cannot be written.
     """
-    found = ((entry, _problem(entry_folder(cache_folder(), entry.key))) for entry in list_cache())
-    damaged = tuple((entry, problem) for entry, problem in found if problem)
-    if damaged:
-        _remove(tuple(entry for entry, _ in damaged))
-    return damaged
-
-
-def _problem(entry: Path) -> str | None:
-    """Why an entry is damaged, in words; it is not evicted meanwhile."""
-    try:
-        with (entry / RECORD).open("rb") as file:
-            take_shared_lock(file)
-            record = read_entry(file)
-            if record is None or record.key != entry.name:
-                return f"{RECORD} is damaged, or of another version"
-            return entry_problem(entry, record)
-    except FileNotFoundError:  # evicted meanwhile
-        return None
-
-
-def _remove(chosen: tuple[CacheEntry, ...]) -> tuple[CacheEntry, ...]:
+    damaged = []
     with _named_cache(cache_folder()):
-        removed = evict(cache_folder(), [entry.key for entry in chosen])
-    return tuple(entry for entry in chosen if entry.key in removed)
+        for entry in list_cache():
+            folder = cache_folder() / "rows" / entry.key
+            problem = _problem(folder)
+            if problem and folder.is_dir():  # else it was removed meanwhile
+                damaged.append((entry, problem))
+                _remove(folder)
+    return tuple(damaged)
 
 
-def cache_limit() -> int:
-    """The maximum size of all entries in bytes: TCMRL_CACHE_LIMIT (such as `20G`), or 100 GB.
+def _make_room(folder: Path, needed: int) -> None:
+    """Removes the least recently used entries until a new entry fits; removes none if it cannot fit."""
+    limit, entries = cache_limit(), list_cache()
+    taken = sum(entry.bytes for entry in entries)
+    idle = [entry for entry in entries if not entry.in_use]
+    kept = taken - sum(entry.bytes for entry in idle)
+    while idle and kept + needed <= limit < taken + needed:
+        entry = idle.pop(0)
+        if _remove(folder / "rows" / entry.key):
+            taken -= entry.bytes
+        else:
+            kept += entry.bytes
+    if taken + needed > limit:
+        raise CacheError(
+            f"{folder}: decoded steps take {size(needed)}, {size(kept)} are in use, and the cache is limited "
+            f"to {size(limit)}; raise TCMRL_CACHE_LIMIT or --memory-limit, or wait for the other processes"
+        )
 
-    Raises:
-        CacheError: the variable is not a valid size.
-    """
-    text = os.environ.get("TCMRL_CACHE_LIMIT")
-    return parse_bytes(text) if text else CACHE_BYTES
+
+def _remove(entry: Path) -> bool:
+    """Removes an entry unless a process reads it; its record goes first, so that none opens the rest."""
+    with contextlib.ExitStack() as lock:
+        if (entry / RECORD).is_file():
+            file = lock.enter_context((entry / RECORD).open("r+b"))
+            if not try_exclusive_lock(file) or not is_current(file, entry / RECORD):
+                return False
+            (entry / RECORD).unlink()
+        remove_tree(entry)
+    return not entry.exists()
+
+
+@contextlib.contextmanager
+def _writer_lock(folder: Path, say: Callable[[str], None] | None) -> Iterator[None]:
+    """Holds the cache's lock; waits while another process holds it, and names it if it is seen twice."""
+    seen = said = ""
+    with contextlib.ExitStack() as stack:
+        while True:
+            try:
+                stack.enter_context(lock_file(folder / LOCK, f"the cache {folder}"))
+                break
+            except LockedError as error:
+                holder = str(error).partition(";")[0]
+            if say and holder == seen != said:
+                say(f"{holder}; waiting for it")
+                said = holder
+            seen = holder
+            time.sleep(WAIT_SECONDS)
+        yield
 
 
 @contextlib.contextmanager
@@ -187,8 +443,3 @@ def _named_cache(folder: Path) -> Iterator[None]:
             f"the cache {folder} cannot be used ({reason}); set TCMRL_CACHE to a folder that can be written, "
             "or raise --memory-limit"
         ) from None
-
-
-def _table_bytes(selection: "Selection", dense: bool) -> int:
-    rows, width = table_shape(selection, plan_rows(selection, dense=dense))
-    return 4 * rows * width

@@ -1,9 +1,9 @@
-"""Packed rows: all selected steps in one float32 table."""
+"""Packed rows: all selected steps in one float32 table, and statistics of them."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -20,10 +20,16 @@ if TYPE_CHECKING:
 
 Indices = npt.NDArray[np.int64]
 Table = npt.NDArray[np.float32]
+Values = npt.NDArray[np.float64]
 
 ROW_ARRAYS = ("observations", "actions", "rewards", "terminated", "episode_offsets")
 READERS = 8
 """Maximum number of parts that are read at the same time; limits memory."""
+
+CHUNK_ROWS = 2**16
+"""Rows that are taken to double precision together."""
+
+SMALLEST_STD = 1e-6
 
 
 @dataclass(frozen=True)
@@ -41,19 +47,18 @@ class Episodes:
     task_ranges: Indices
 
     @classmethod
-    def of(cls, lengths: Sequence[Indices], tasks: Sequence[int]) -> "Episodes":
+    def of(cls, lengths: Indices, tasks: Indices) -> "Episodes":
         """The positions of episodes with consecutive rows.
 
         Args:
-            lengths: per part, the lengths of its episodes.
-            tasks: per part, the position of its task; ascending.
+            lengths: (episodes,) number of steps, 0 too.
+            tasks: (episodes,) positions of their tasks, ascending.
         """
-        flat = np.concatenate(lengths)
-        starts = np.cumsum(flat + 1) - flat - 1
-        owner = np.repeat(tasks, [len(part) for part in lengths])[flat > 0]
-        positions = np.arange(max(tasks) + 1)
+        starts = np.cumsum(lengths + 1) - lengths - 1
+        owner = tasks[lengths > 0]
+        positions = np.arange(tasks[-1] + 1)
         ranges = np.stack([np.searchsorted(owner, positions, side) for side in ("left", "right")], axis=1)
-        return cls(starts[flat > 0], flat[flat > 0], ranges.astype(np.int64))
+        return cls(starts[lengths > 0], lengths[lengths > 0], ranges.astype(np.int64))
 
     @property
     def longest(self) -> int:
@@ -110,7 +115,7 @@ class PartRows:
         first: its first row.
         last: its last row + 1.
         episodes: number of its episodes.
-        dense: whether its dense rewards are read.
+        dense: whether rows hold dense rewards.
     """
 
     dataset: "Dataset"
@@ -151,46 +156,53 @@ def read_rows(selection: "Selection", *, dense: bool = False) -> PackedRows:
     """
     plan = plan_rows(selection, dense=dense)
     table: Table = np.zeros(table_shape(selection, plan), dtype=np.float32)
-    lengths = list(map_parts(plan, lambda part: read_part(part, table[part.first : part.last])))
-    return selection_rows(selection, table, Episodes.of(lengths, [part.task for part in plan]))
+    return pack_rows(selection, plan, table, fill_table(table, plan))
 
 
-def selection_rows(selection: "Selection", table: Table, episodes: Episodes) -> PackedRows:
-    """The packed rows of a selection, given the filled table."""
+def pack_rows(selection: "Selection", plan: Sequence[PartRows], table: Table, lengths: Indices) -> PackedRows:
+    """The packed rows of a selection, given the filled table and the lengths of all episodes."""
     environment = selection.dataset.environment
+    tasks = np.repeat([part.task for part in plan], [part.episodes for part in plan])
     indices = np.array([task.index for task in selection.tasks], dtype=np.int64)
+    episodes = Episodes.of(lengths, tasks)
     return PackedRows(table, episodes, environment.observation_dim, environment.action_dim, indices)
 
 
-def map_parts(plan: Sequence[PartRows], read: Callable[[PartRows], Any]) -> Iterator[Any]:
-    """Yields the results of `read` for all parts, in order; several threads read at the same time."""
-    with ThreadPoolExecutor(min(READERS, available_cores())) as pool:
-        yield from pool.map(read, plan)
-
-
-def read_part(part: PartRows, out: Table, *, check_digests: bool = False) -> Indices:
-    """Reads a part into rows of zeros; returns the lengths of its episodes.
+def fill_table(table: Table, plan: Sequence[PartRows], *, check_digests: bool = False) -> Indices:
+    """Reads parts into a table of zeros, several at a time; returns the lengths of all episodes.
 
     Args:
-        part: the part.
-        out: (observations, width), the part's rows.
-        check_digests: hash the decoded arrays and compare them with the part's record; for rows that others
-            receive under the part's id.
+        table: of the shape that `table_shape` gives.
+        plan: the parts.
+        check_digests: hash the decoded arrays and compare them with the parts' records; for rows that others
+            receive under the parts' ids.
 
     Raises:
-        SelectionError: the part has no dense rewards, and they are to be read.
+        SelectionError: a part has no dense rewards, and they are to be read.
         StoreError: arrays cannot be decoded, do not form episodes, or are not those of the part's record;
             the message names the part.
     """
+    with ThreadPoolExecutor(min(READERS, available_cores())) as pool:
+        lengths = pool.map(
+            lambda part: read_part(part, table[part.first : part.last], check_digests=check_digests), plan
+        )
+        return np.concatenate(list(lengths))
+
+
+def read_part(part: PartRows, out: Table, *, check_digests: bool) -> Indices:
+    """Reads a part into rows of zeros, as `fill_table` does; returns the lengths of its episodes."""
     if part.dense:
         _check_dense(part)
     arrays = part.dataset.arrays(*part.key, names=row_arrays(part.dense))
     if check_digests:
         _check_digests(part, arrays)
     try:
-        return fill_rows(out, arrays)
+        lengths = fill_rows(out, arrays)
+        if len(lengths) != part.episodes:
+            raise StoreError(f"{len(lengths)} episodes instead of {part.episodes}")
     except StoreError as error:
         raise StoreError(f"{part.dataset.file_of(part.key)}: {error}; run `tcmrl-data repair`") from None
+    return lengths
 
 
 def row_arrays(dense: bool) -> tuple[str, ...]:
@@ -254,3 +266,99 @@ def fill_rows(out: Table, arrays: Arrays) -> Indices:
     for column, name in enumerate(scalars, start=columns):
         out[steps, column] = arrays[name]
     return lengths
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Statistics of the selected transitions, float64; standard deviations are at least 1e-6.
+
+    Attributes:
+        observation_mean, observation_std: (observation_dim,).
+        delta_mean, delta_std: (observation_dim,), for next observation minus observation.
+        action_mean, action_std: (action_dim,).
+        reward_mean, reward_std, reward_min, reward_max: statistics of the reward per step.
+        dense_reward_range: smallest and largest dense reward per step; None if dense rewards are not loaded.
+        longest_episode: length of the longest episode in steps.
+    """
+
+    observation_mean: Values
+    observation_std: Values
+    delta_mean: Values
+    delta_std: Values
+    action_mean: Values
+    action_std: Values
+    reward_mean: float
+    reward_std: float
+    reward_min: float
+    reward_max: float
+    longest_episode: int
+    dense_reward_range: tuple[float, float] | None = None
+
+
+def moments_of(rows: PackedRows) -> Moments:
+    """Statistics of all transitions of the rows, computed in double precision."""
+    table, episodes = rows.table, rows.episodes
+    stop = int(episodes.starts[-1] + episodes.lengths[-1])
+    width, flags = rows.observation_dim, rows.terminated_column
+    total = _Sums(2 * rows.observation_dim + rows.action_dim + 1 + rows.has_dense)
+    for first in range(0, stop, CHUNK_ROWS):
+        last = min(first + CHUNK_ROWS, stop)
+        kept = _is_step(episodes, first, last)
+        values = table[first:last][kept].astype(np.float64)
+        following = table[first + 1 : last + 1, :width][kept]
+        columns = (following - values[:, :width], values[:, :flags], values[:, flags + 1 :])
+        total.add(np.concatenate(columns, axis=1))
+    mean, std = total.mean, total.std
+    delta, observation = slice(0, width), slice(width, 2 * width)
+    action, reward = slice(2 * width, width + flags - 1), width + flags - 1
+    dense = (float(total.least[-1]), float(total.most[-1])) if rows.has_dense else None
+    return Moments(
+        observation_mean=mean[observation],
+        observation_std=std[observation],
+        delta_mean=mean[delta],
+        delta_std=std[delta],
+        action_mean=mean[action],
+        action_std=std[action],
+        reward_mean=float(mean[reward]),
+        reward_std=float(std[reward]),
+        reward_min=float(total.least[reward]),
+        reward_max=float(total.most[reward]),
+        longest_episode=episodes.longest,
+        dense_reward_range=dense,
+    )
+
+
+def _is_step(episodes: Episodes, first: int, last: int) -> npt.NDArray[np.bool_]:
+    """Whether rows first to last - 1 are transitions, (last - first,); the others are last observations."""
+    rows = np.arange(first, last)
+    latest = np.searchsorted(episodes.starts, rows, side="right") - 1
+    ends = episodes.starts[latest] + episodes.lengths[latest]
+    result: npt.NDArray[np.bool_] = (latest >= 0) & (rows < ends)
+    return result
+
+
+class _Sums:
+    """Mean, variance and range of columns, merged chunk by chunk (Chan, Golub and LeVeque, 1983)."""
+
+    def __init__(self, columns: int) -> None:
+        self.count, self.mean, self._squares = 0, np.zeros(columns), np.zeros(columns)
+        self.least, self.most = np.full(columns, np.inf), np.full(columns, -np.inf)
+
+    def add(self, values: Values) -> None:
+        if not len(values):
+            return
+        count, mean = self.count + len(values), values.mean(axis=0)
+        difference = mean - self.mean
+        between = difference**2 * self.count * len(values) / count
+        self._squares += np.square(values - mean).sum(axis=0) + between
+        self.mean = self.mean + difference * len(values) / count
+        self.least, self.most = (
+            np.minimum(self.least, values.min(axis=0)),
+            np.maximum(self.most, values.max(axis=0)),
+        )
+        self.count = count
+
+    @property
+    def std(self) -> Values:
+        result: Values = np.maximum(np.sqrt(self._squares / self.count), SMALLEST_STD)
+        return result

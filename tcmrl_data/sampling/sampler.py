@@ -1,8 +1,13 @@
-"""The sampler of meta-training batches."""
+"""The sampler of meta-training batches, and their prefetching by a thread."""
 
 import copy
-from collections.abc import Callable
-from typing import Self
+import itertools
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from types import TracebackType
+from typing import Generic, Self, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
@@ -12,15 +17,13 @@ from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Reward
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_sequence
-from tcmrl_data.sampling.batch import Batch, Moments
 from tcmrl_data.sampling.cache import load_rows
 from tcmrl_data.sampling.draws import Draws
-from tcmrl_data.sampling.endings import Endings
-from tcmrl_data.sampling.gather import Gatherer, place_table
-from tcmrl_data.sampling.moments import moments_of
-from tcmrl_data.sampling.prefetch import Prefetch
+from tcmrl_data.sampling.gather import Batch, Endings, Gatherer, place_table
 from tcmrl_data.sampling.request import BatchRequest, Trajectories
-from tcmrl_data.sampling.rows import Indices, PackedRows
+from tcmrl_data.sampling.rows import Indices, Moments, PackedRows, moments_of
+
+Item = TypeVar("Item")
 
 
 def open_sampler(
@@ -31,7 +34,7 @@ def open_sampler(
     stream: int = 0,
     device: str = "cpu",
     memory_limit: int | None = None,
-    say: Callable[[str], None] = lambda message: None,
+    say: Callable[[str], None] | None = None,
 ) -> "Sampler":
     """Loads a selection once and serves meta-training batches from it.
 
@@ -200,7 +203,7 @@ class Sampler:
         """The n-th batch, n >= 0; depends only on n, the selection, request, seed and stream."""
         return self._gather(self._draws(n))
 
-    def prefetch(self, first: int, last: int, *, depth: int = 2) -> Prefetch[Batch]:
+    def prefetch(self, first: int, last: int, *, depth: int = 2) -> "Prefetch[Batch]":
         """An iterator over batches `first` to `last - 1`, made ahead by a thread; a context manager.
 
         Args:
@@ -213,3 +216,64 @@ class Sampler:
     def moments(self) -> Moments:
         """Statistics of all selected transitions."""
         return moments_of(self._rows)
+
+
+@final
+class Prefetch(Generic[Item]):
+    """An iterator over items that one thread makes ahead of their use; a context manager.
+
+    Leaving the context ends the thread. An exception raised by `make` is raised by the iterator, in the place
+    of the item.
+
+    Attributes:
+        waited: total time in seconds that `next` took so far.
+
+    Args:
+        make: makes the item with a given number; called in another thread.
+        numbers: numbers of the items, in order.
+        depth: number of items that are kept ready, while one more is made; 0 makes an item when it is needed,
+            without a thread.
+
+    Example:
+        >>> with Prefetch(lambda n: n * n, range(3), depth=2) as squares:
+        ...     list(squares)
+        [0, 1, 4]
+    """
+
+    def __init__(self, make: Callable[[int], Item], numbers: Sequence[int], *, depth: int) -> None:
+        self._make, self._numbers, self._depth = make, iter(numbers), depth
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="prefetch")
+        self._ahead: deque[Future[Item]] = deque()
+        self.waited = 0.0
+
+    def __enter__(self) -> Self:
+        self._go_ahead()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._numbers = iter(())
+        self._thread.shutdown(cancel_futures=True)
+        self._ahead.clear()
+
+    def __iter__(self) -> Iterator[Item]:
+        return self
+
+    def __next__(self) -> Item:
+        began = time.perf_counter()
+        try:
+            if not self._depth:
+                return self._make(next(self._numbers))
+            if not self._ahead:
+                raise StopIteration
+            item = self._ahead.popleft().result()
+            self._go_ahead()
+            return item
+        finally:
+            self.waited += time.perf_counter() - began
+
+    def _go_ahead(self) -> None:
+        if self._depth:
+            for number in itertools.islice(self._numbers, self._depth + 1 - len(self._ahead)):
+                self._ahead.append(self._thread.submit(self._make, number))

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     import torch
     from tensordict import TensorDict
 
-    from tcmrl_data.sampling.batch import Steps
+    from tcmrl_data.sampling.gather import Steps
 
 
 def to_tensordict(selection: Selection) -> "TensorDict":
