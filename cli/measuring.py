@@ -11,7 +11,7 @@ from .frame import print_json, remark, stopped_by_signals, typed_command
 from .progress import PartsProgress, StageProgress
 
 if TYPE_CHECKING:
-    from tcmrl_data.quality.records import Measured
+    from tcmrl_data.quality.measured import Measured
 
 Found = TypeVar("Found", bound="Measured")
 Report = Callable[[str], PartsProgress]

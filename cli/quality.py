@@ -13,7 +13,7 @@ from .measuring import MeasureOptions, plot_option, run_measure, stage_cells, ti
 if TYPE_CHECKING:
     from tcmrl_data import Coverage, Quality, Rewards
     from tcmrl_data.dataset.tiers import Tier
-    from tcmrl_data.quality.records import StageQuality
+    from tcmrl_data.quality.scores import StageQuality
 
 TIERS_SHOWN: tuple["Tier", ...] = ("random", "medium", "expert")
 """Tiers that the table counts; the others are made of these."""
@@ -35,7 +35,7 @@ def quality(dataset: Path, as_json: bool, quiet: bool, plot: Path | None) -> Non
       tcmrl-data inspect quality data/point-robot --json --plot quality.png
     """
     import tcmrl_data
-    from tcmrl_data.quality.pictures import plot_quality
+    from tcmrl_data.quality.scores import plot_quality
 
     opened = tcmrl_data.open_dataset(dataset)
     options = MeasureOptions(as_json, quiet, plot)
@@ -74,7 +74,7 @@ def coverage(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, cell:
       tcmrl-data inspect coverage data/point-robot --cell 1 --json --plot coverage.png
     """
     import tcmrl_data
-    from tcmrl_data.quality.pictures import plot_coverage
+    from tcmrl_data.quality.coverage import plot_coverage
 
     opened = tcmrl_data.open_dataset(dataset)
     run_measure(
@@ -105,7 +105,7 @@ def rewards(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, bins: 
       tcmrl-data inspect rewards data/sparse-point-robot --json --plot rewards.png
     """
     import tcmrl_data
-    from tcmrl_data.quality.pictures import plot_rewards
+    from tcmrl_data.quality.rewards import plot_rewards
 
     opened = tcmrl_data.open_dataset(dataset)
     run_measure(

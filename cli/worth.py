@@ -70,7 +70,7 @@ def transfer(
       tcmrl-data inspect transfer data/half-cheetah-vel --tasks 10 --episodes 1 --json
     """
     import tcmrl_data
-    from tcmrl_data.quality.worth_pictures import plot_transfer
+    from tcmrl_data.quality.transfer import plot_transfer
 
     opened = tcmrl_data.open_dataset(dataset)
     run_measure(
@@ -129,7 +129,7 @@ def worth(
       tcmrl-data inspect worth data/half-cheetah-vel --tasks 10 --episodes 1 --plot worth.png
     """
     import tcmrl_data
-    from tcmrl_data.quality.worth_pictures import plot_worth
+    from tcmrl_data.quality.worth import plot_worth
 
     opened = tcmrl_data.open_dataset(dataset)
     run_measure(

@@ -11,7 +11,7 @@ from tcmrl_cli.data import data
 from tcmrl_data import Dataset, SelectionError, Trajectory, measure_coverage, measure_rewards
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.quality.coverage import Grid
-from tcmrl_data.quality.steps import PartSteps, read_steps, spread_tasks
+from tcmrl_data.quality.measured import PartSteps, read_steps
 from tcmrl_data.store.keys import PartKey
 from tests.commands import Call, in_process
 from tests.graded import graded_dataset, made_dataset
@@ -94,7 +94,7 @@ def test_rewards_are_counted_by_value_and_silent_episodes_apart(tmp_path: Path) 
 def test_rewards_beyond_the_sampled_range_count_in_the_outer_bins(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tcmrl_data.quality.steps.SAMPLED_PARTS", 1)
+    monkeypatch.setattr("tcmrl_data.quality.measured.SAMPLED_PARTS", 1)
     parts = {
         PartKey(0, 0): [episode([0.0, 1.0], [0.0, 2.0])],
         PartKey(0, 5): [episode([0.0, 1.0], [-9.0, 9.0])],
@@ -121,12 +121,6 @@ def test_values_that_are_not_finite_are_refused_with_their_file(tmp_path: Path) 
     parts = {PartKey(0, 0): [episode([0.0, np.inf])]}
     with pytest.raises((StoreError, SelectionError), match="not finite"):
         measure_coverage(made_dataset(tmp_path / "made", parts))
-
-
-def test_tasks_are_spread_evenly_with_both_ends(tiny: Dataset) -> None:
-    tasks = list(tiny.tasks)
-    assert [task.index for task in spread_tasks(tasks, 3)] == [0, 40, 99]
-    assert spread_tasks(tasks, 9) == tasks
 
 
 @pytest.mark.parametrize("what", ["coverage", "rewards"])

@@ -9,8 +9,8 @@ from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, SelectionError, TcmrlError, measure_transfer, measure_worth
 from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
-from tcmrl_data.quality.records import Transfer, TransferTask
-from tcmrl_data.quality.steps import PartSteps
+from tcmrl_data.quality.measured import PartSteps
+from tcmrl_data.quality.transfer import Transfer, TransferTask
 from tcmrl_data.quality.visibility import Half, Sample, draw_sample, visibility
 from tcmrl_data.quality.worth import context_worth
 from tcmrl_data.store.keys import PartKey

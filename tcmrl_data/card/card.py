@@ -16,8 +16,7 @@ from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import StoreError, TcmrlError
 from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
-from tcmrl_data.quality.records import Quality
-from tcmrl_data.quality.scores import measure_quality
+from tcmrl_data.quality.scores import Quality, measure_quality
 from tcmrl_data.recipe.recipe import load_recipe
 from tcmrl_data.store.manifest import FOREIGN_KINDS
 from tcmrl_data.store.part_table import REFERENCES

@@ -1,9 +1,16 @@
-"""Keyed seeds: the seed of a random stream depends on its purpose and not on the order of drawing."""
+"""Keyed seeds: the seed of a random stream depends on its purpose and not on the order of drawing.
+
+And the choice that leaves nothing to chance: `evenly_spread`.
+"""
 
 import enum
 import hashlib
+from collections.abc import Sequence
+from typing import TypeVar
 
 import numpy as np
+
+Item = TypeVar("Item")
 
 NO_TASK = 2**32 - 1
 """The task entry for a stream that belongs to the whole environment."""
@@ -73,3 +80,14 @@ def keyed_generator(
 ) -> np.random.Generator:
     """A NumPy generator; arguments as for `keyed_sequence`."""
     return np.random.default_rng(keyed_sequence(root, environment, task, purpose, *index))
+
+
+def evenly_spread(items: Sequence[Item], number: int) -> list[Item]:
+    """At most `number` items, evenly spread over all, the first and the last among them.
+
+    Example:
+        >>> evenly_spread("abcdefghi", 3)
+        ['a', 'e', 'i']
+    """
+    positions = np.linspace(0, len(items) - 1, min(number, len(items))).round().astype(int)
+    return [items[position] for position in positions]

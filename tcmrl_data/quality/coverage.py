@@ -5,8 +5,9 @@ standard deviation of every column. With many columns nearly every step has a ce
 tells little more than the number of steps.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from statistics import fmean
 from typing import Any
 
@@ -14,26 +15,31 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.picture import new_figure, save_figure
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.quality.records import (
-    Coverage,
-    Overlap,
-    SnapshotCoverage,
-    StageCoverage,
-    TaskCoverage,
-    heading,
-)
-from tcmrl_data.quality.scores import in_stage_order, trajectory_quality
-from tcmrl_data.quality.steps import (
+from tcmrl_data.foundation.records import Record
+from tcmrl_data.foundation.seeding import evenly_spread
+from tcmrl_data.quality.measured import (
+    COLORS,
+    SMALLEST_STD,
+    TQ_LABEL,
+    Measured,
+    MeasuredPart,
+    MeasuredStage,
+    MeasuredTask,
     PartSteps,
-    Progress,
-    parts_by_task,
-    read_steps,
+    by_stage,
+    draw_matrix,
+    filled_parts,
+    heading,
+    label_axes,
     sampled_parts,
-    spread_tasks,
+    steps_by_task,
+    title,
 )
+from tcmrl_data.quality.scores import trajectory_quality
 from tcmrl_data.store.keys import PartKey
 
 CELL = 0.5
@@ -42,13 +48,73 @@ CELL = 0.5
 OVERLAP_TASKS = 20
 """Tasks in the matrix of overlaps by default."""
 
-SMALLEST_STD = 1e-6
-"""Columns whose standard deviation is smaller do not vary."""
-
 LARGEST_CELL = 2**31 - 1
 
 Cells = npt.NDArray[Any]
 """Distinct cells, sorted; one opaque item each."""
+
+
+class SnapshotCoverage(MeasuredPart):
+    """The coverage of a part.
+
+    Attributes:
+        steps: number of environment steps.
+        cells: number of different state-action cells.
+        saco: `cells` as a share of the cells of all parts of the task.
+        tq: trajectory quality, as in `SnapshotQuality`.
+    """
+
+    steps: int
+    cells: int
+    saco: float
+    tq: float | None
+
+
+class TaskCoverage(MeasuredTask):
+    """The coverage of a task's parts; `cells` counts those of all parts together."""
+
+    cells: int
+    snapshots: tuple[SnapshotCoverage, ...]
+
+
+class StageCoverage(MeasuredStage):
+    """Means over a stage's parts, whose number is `parts`."""
+
+    parts: int
+    steps: float
+    cells: float
+    saco: float
+    tq: float | None
+
+
+class Overlap(Record):
+    """How far tasks visit the same states.
+
+    Attributes:
+        tasks: indices of tasks, evenly spread over the dataset's.
+        shares: row i, column j: share of the state cells of task `tasks[i]` that task `tasks[j]` visits too.
+    """
+
+    tasks: tuple[int, ...]
+    shares: tuple[tuple[float, ...], ...]
+
+
+class Coverage(Measured):
+    """State-action coverage of all parts: the document of `inspect coverage --json`.
+
+    Attributes:
+        cell: width of a cell in standard deviations of each column.
+        columns: number of observation and action columns that vary; the grid has as many dimensions.
+        stages: means by step and split.
+        tasks: every part.
+        overlap: of the states that tasks visit.
+    """
+
+    cell: float
+    columns: int
+    stages: tuple[StageCoverage, ...]
+    tasks: tuple[TaskCoverage, ...]
+    overlap: Overlap
 
 
 def measure_coverage(
@@ -56,7 +122,7 @@ def measure_coverage(
     *,
     cell: float = CELL,
     overlap_tasks: int = OVERLAP_TASKS,
-    progress: Progress = lambda done, total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Coverage:
     """State-action coverage (SACo) of every part beside its trajectory quality.
 
@@ -81,27 +147,24 @@ def measure_coverage(
     if not 0 < cell < np.inf:
         raise SelectionError(f"--cell {cell} is not a positive number of standard deviations")
     grid = _grid(sampled_parts(dataset), cell)
-    tasks = parts_by_task(dataset)
-    total, done = sum(len(keys) for _, keys in tasks), 0
-    compared = {task.index for task in spread_tasks([task for task, _ in tasks], overlap_tasks)}
+    tasks = list(dict.fromkeys(key.task for key in filled_parts(dataset)))
+    compared = evenly_spread(tasks, overlap_tasks)
     rows, visited = [], dict[int, Cells]()
-    for task, keys in tasks:
+    for task, parts in steps_by_task(dataset, progress):
         pairs, states = dict[PartKey, Cells](), grid.no_states
-        for key in keys:
-            steps = read_steps(dataset, key)
+        for key, steps in parts:
             pairs[key] = grid.pairs(steps)
             if task.index in compared:
                 states = np.union1d(states, grid.states(steps))
-            done += 1
-            progress(done, total)
         rows.append(_task_coverage(dataset, task, pairs))
         if task.index in compared:
             visited[task.index] = states
+    stages = by_stage((task.split, row) for task in rows for row in task.snapshots)
     return Coverage(
         **heading(dataset),
         cell=cell,
         columns=grid.columns,
-        stages=tuple(_stages(rows)),
+        stages=tuple(_stage(*stage) for stage in stages),
         tasks=tuple(rows),
         overlap=_overlap(visited),
     )
@@ -191,23 +254,17 @@ def _task_coverage(dataset: Dataset, task: Task, pairs: dict[PartKey, Cells]) ->
     return TaskCoverage(task=task.index, split=task.split, cells=union, snapshots=snapshots)
 
 
-def _stages(tasks: Iterable[TaskCoverage]) -> Iterable[StageCoverage]:
-    found: dict[tuple[int, Split], list[SnapshotCoverage]] = {}
-    for task in tasks:
-        for snapshot in task.snapshots:
-            found.setdefault((snapshot.step, task.split), []).append(snapshot)
-    for step, split in in_stage_order(found):
-        rows = found[step, split]
-        known = [row.tq for row in rows if row.tq is not None]
-        yield StageCoverage(
-            step=step,
-            split=split,
-            parts=len(rows),
-            steps=fmean(row.steps for row in rows),
-            cells=fmean(row.cells for row in rows),
-            saco=fmean(row.saco for row in rows),
-            tq=fmean(known) if len(known) == len(rows) else None,
-        )
+def _stage(step: int, split: Split, rows: Sequence[SnapshotCoverage]) -> StageCoverage:
+    known = [row.tq for row in rows if row.tq is not None]
+    return StageCoverage(
+        step=step,
+        split=split,
+        parts=len(rows),
+        steps=fmean(row.steps for row in rows),
+        cells=fmean(row.cells for row in rows),
+        saco=fmean(row.saco for row in rows),
+        tq=fmean(known) if len(known) == len(rows) else None,
+    )
 
 
 def _overlap(visited: dict[int, Cells]) -> Overlap:
@@ -217,3 +274,29 @@ def _overlap(visited: dict[int, Cells]) -> Overlap:
         for mine in visited.values()
     )
     return Overlap(tasks=tuple(visited), shares=shares)
+
+
+def plot_coverage(found: Coverage, file: Path) -> None:
+    """Draws coverage against trajectory quality, a line per split along the steps, and overlaps of tasks.
+
+    Raises:
+        SelectionError: the file's name is none of a picture.
+    """
+    figure = new_figure(10.0, 4.4)
+    left, right = figure.subplots(1, 2)
+    for split, color in COLORS.items():
+        parts = [row for task in found.tasks if task.split == split for row in task.snapshots]
+        known = [(row.saco, row.tq) for row in parts if row.tq is not None]
+        if known:
+            left.scatter(*zip(*known, strict=True), s=5, alpha=0.25, color=color, linewidths=0)
+        stages = [stage for stage in found.stages if stage.split == split and stage.tq is not None]
+        saco, tq = [stage.saco for stage in stages], [stage.tq for stage in stages]
+        left.plot(saco, tq, "o-", color=color, label=f"{split}, means by step", markersize=4)
+        for stage in stages[:: max(1, len(stages) - 1)] if split == "train" else ():
+            place = (stage.saco, stage.tq or 0.0)
+            left.annotate(f"step {stage.step:,}", place, (6, 6), textcoords="offset points", fontsize="small")
+    label_axes(left, title(found), "state-action coverage (share of the task's cells)", TQ_LABEL)
+    left.legend(fontsize="small")
+    draw_matrix(right, found.overlap.shares, found.overlap.tasks, "share of states visited too")
+    right.set(title="states that tasks share", xlabel="task", ylabel="task")
+    save_figure(figure, file)

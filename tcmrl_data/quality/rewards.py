@@ -1,29 +1,107 @@
 """Stored rewards: how they are distributed, and how often there is none."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
+from pathlib import Path
 from statistics import fmean
 
 import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.picture import new_figure, save_figure
 from tcmrl_data.envs.tasks import Split
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.quality.records import Rewards, SnapshotRewards, StageRewards, TaskRewards, heading
-from tcmrl_data.quality.scores import in_stage_order
-from tcmrl_data.quality.steps import PartSteps, Progress, parts_by_task, read_steps, sampled_parts
+from tcmrl_data.quality.measured import (
+    COLORS,
+    STEPS_LABEL,
+    Measured,
+    MeasuredPart,
+    MeasuredStage,
+    MeasuredTask,
+    PartSteps,
+    by_stage,
+    heading,
+    label_axes,
+    sampled_parts,
+    steps_by_task,
+    title,
+)
 from tcmrl_data.store.keys import PartKey
 
 BINS = 40
 """Default number of bins."""
 
-Stage = tuple[int, Split]
 Counts = npt.NDArray[np.int64]
 
 
+class SnapshotRewards(MeasuredPart):
+    """The stored rewards of a part.
+
+    Attributes:
+        steps: number of rewards.
+        zero: share of rewards that are exactly zero.
+        silent: share of episodes in which all rewards are zero.
+        mean: of the rewards.
+        std: of the rewards, the population's.
+        min: smallest reward.
+        max: largest reward.
+    """
+
+    steps: int
+    zero: float
+    silent: float
+    mean: float
+    std: float
+    min: float
+    max: float
+
+
+class TaskRewards(MeasuredTask):
+    """The rewards of a task's parts."""
+
+    snapshots: tuple[SnapshotRewards, ...]
+
+
+class StageRewards(MeasuredStage):
+    """The rewards of a stage; `zero`, `silent`, `mean` are means over its parts.
+
+    Attributes:
+        parts: number of parts.
+        steps: number of rewards.
+        zero: as in `SnapshotRewards`; `silent` and `mean` likewise.
+        min: smallest reward.
+        max: largest reward.
+        counts: number of rewards in every bin.
+    """
+
+    parts: int
+    steps: int
+    zero: float
+    silent: float
+    mean: float
+    min: float
+    max: float
+    counts: tuple[int, ...]
+
+
+class Rewards(Measured):
+    """Stored rewards of all parts: the document of `inspect rewards --json`.
+
+    Attributes:
+        edges: borders of the bins, one more than bins. The first and the last bin also count what lies
+            beyond, because the borders come from a sample of the parts.
+        stages: by step and split.
+        tasks: every part.
+    """
+
+    edges: tuple[float, ...]
+    stages: tuple[StageRewards, ...]
+    tasks: tuple[TaskRewards, ...]
+
+
 def measure_rewards(
-    dataset: Dataset, *, bins: int = BINS, progress: Progress = lambda done, total: None
+    dataset: Dataset, *, bins: int = BINS, progress: Callable[[int, int], None] | None = None
 ) -> Rewards:
     """Histograms of stored rewards by step and split, and the share of zero rewards in every part.
 
@@ -39,25 +117,20 @@ def measure_rewards(
     if bins < 1:
         raise SelectionError(f"--bins {bins} is not a positive number")
     edges = _edges([steps.rewards for steps in sampled_parts(dataset)], bins)
-    tasks = parts_by_task(dataset)
-    total, done = sum(len(keys) for _, keys in tasks), 0
-    counts, rows = dict[Stage, Counts](), []
-    for task, keys in tasks:
+    counts, rows = dict[tuple[int, Split], Counts](), []
+    for task, parts in steps_by_task(dataset, progress):
         snapshots = []
-        for key in keys:
-            steps = read_steps(dataset, key)
+        for key, steps in parts:
             snapshots.append(_snapshot(key, steps))
             inside = np.clip(steps.rewards, edges[0], edges[-1])
             found = np.histogram(inside, edges)[0].astype(np.int64)
-            stage = (key.step, task.split)
-            counts[stage] = counts.get(stage, 0) + found
-            done += 1
-            progress(done, total)
+            counts[key.step, task.split] = counts.get((key.step, task.split), 0) + found
         rows.append(TaskRewards(task=task.index, split=task.split, snapshots=tuple(snapshots)))
+    stages = by_stage((task.split, row) for task in rows for row in task.snapshots)
     return Rewards(
         **heading(dataset),
         edges=tuple(edges.tolist()),
-        stages=tuple(_stages(rows, counts)),
+        stages=tuple(_stage(step, split, members, counts[step, split]) for step, split, members in stages),
         tasks=tuple(rows),
     )
 
@@ -87,22 +160,51 @@ def _snapshot(key: PartKey, steps: PartSteps) -> SnapshotRewards:
     )
 
 
-def _stages(tasks: Iterable[TaskRewards], counts: dict[Stage, Counts]) -> Iterable[StageRewards]:
-    found: dict[Stage, list[SnapshotRewards]] = {}
-    for task in tasks:
-        for snapshot in task.snapshots:
-            found.setdefault((snapshot.step, task.split), []).append(snapshot)
-    for step, split in in_stage_order(found):
-        rows = found[step, split]
-        yield StageRewards(
-            step=step,
-            split=split,
-            parts=len(rows),
-            steps=sum(row.steps for row in rows),
-            zero=fmean(row.zero for row in rows),
-            silent=fmean(row.silent for row in rows),
-            mean=fmean(row.mean for row in rows),
-            min=min(row.min for row in rows),
-            max=max(row.max for row in rows),
-            counts=tuple(counts[step, split].tolist()),
+def _stage(step: int, split: Split, rows: Sequence[SnapshotRewards], counts: Counts) -> StageRewards:
+    return StageRewards(
+        step=step,
+        split=split,
+        parts=len(rows),
+        steps=sum(row.steps for row in rows),
+        zero=fmean(row.zero for row in rows),
+        silent=fmean(row.silent for row in rows),
+        mean=fmean(row.mean for row in rows),
+        min=min(row.min for row in rows),
+        max=max(row.max for row in rows),
+        counts=tuple(counts.tolist()),
+    )
+
+
+def plot_rewards(found: Rewards, file: Path) -> None:
+    """Draws the distribution of rewards by step, training tasks, and the share of zero rewards.
+
+    Raises:
+        SelectionError: the file's name is none of a picture.
+    """
+    figure = new_figure(10.0, 4.4)
+    left, right = figure.subplots(1, 2)
+    stages = [stage for stage in found.stages if stage.split == "train"] or list(found.stages)
+    shares = [[count / max(1, sum(stage.counts)) for count in stage.counts] for stage in stages]
+    image = left.imshow(
+        list(zip(*shares, strict=True)),
+        aspect="auto",
+        origin="lower",
+        extent=(-0.5, len(stages) - 0.5, found.edges[0], found.edges[-1]),
+        norm="log" if any(map(any, shares)) else None,
+    )
+    left.set_xticks(
+        range(len(stages)), [f"{stage.step:,}" for stage in stages], rotation=60, fontsize="small"
+    )
+    left.set(title=f"{title(found)}: rewards, {stages[0].split} tasks", xlabel=STEPS_LABEL, ylabel="reward")
+    left.figure.colorbar(image, ax=left, label="share of steps in a bin")
+    for split, color in COLORS.items():
+        rows = [stage for stage in found.stages if stage.split == split]
+        steps = [stage.step for stage in rows]
+        right.plot(steps, [stage.zero for stage in rows], "o-", color=color, label=f"{split}, zero rewards")
+        right.plot(
+            steps, [stage.silent for stage in rows], "s--", color=color, label=f"{split}, silent episodes"
         )
+    right.set_ylim(-0.03, 1.03)
+    label_axes(right, "how often there is no reward", STEPS_LABEL, "share")
+    right.legend(fontsize="small")
+    save_figure(figure, file)

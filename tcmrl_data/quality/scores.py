@@ -1,16 +1,98 @@
-"""Trajectory quality and tiers of every part, from the tables alone; no part is opened."""
+"""Trajectory quality and tiers of every part, from the tables alone, and aggregates over tasks."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
+import numpy as np
+import numpy.typing as npt
+
+from tcmrl_data.dataset.picture import new_figure, save_figure
 from tcmrl_data.dataset.tables import Tables
 from tcmrl_data.dataset.tiers import TIERS, Tier, task_scores, tier_parts
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.quality.aggregates import spread
-from tcmrl_data.quality.records import Quality, SnapshotQuality, StageQuality, TaskQuality, heading
+from tcmrl_data.foundation.records import Record
+from tcmrl_data.quality.measured import (
+    COLORS,
+    STEPS_LABEL,
+    TQ_LABEL,
+    Measured,
+    MeasuredPart,
+    MeasuredStage,
+    MeasuredTask,
+    by_stage,
+    heading,
+    label_axes,
+    title,
+)
 from tcmrl_data.store.keys import PartKey
 
-SPLITS: tuple[Split, ...] = ("train", "test")
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+FloatArray = npt.NDArray[np.floating]
+
+FEWEST = 5
+"""Below this many values, the values themselves say more than an interval would."""
+
+RESAMPLES, ENDS = 2_000, (0.025, 0.975)
+
+
+class Spread(Record):
+    """A quantity over several tasks.
+
+    Attributes:
+        mean: of all.
+        iqm: interquartile mean, without the lowest and the highest quarter.
+        low: lower end of the 95% bootstrap interval of `iqm`; None with fewer than five values.
+        high: upper end.
+        min: smallest value.
+        max: largest value.
+    """
+
+    mean: float
+    iqm: float
+    low: float | None
+    high: float | None
+    min: float
+    max: float
+
+
+class SnapshotQuality(MeasuredPart):
+    """The quality of a part.
+
+    Attributes:
+        episodes: number of episodes.
+        mean: mean undiscounted return.
+        tq: trajectory quality: 0 is as good as uniform actions, 1 as the best that is known of the task.
+        tiers: the quality tiers that take the part.
+    """
+
+    episodes: int
+    mean: float
+    tq: float | None
+    tiers: tuple[Tier, ...]
+
+
+class TaskQuality(MeasuredTask):
+    """The quality of a task's parts."""
+
+    snapshots: tuple[SnapshotQuality, ...]
+
+
+class StageQuality(MeasuredStage):
+    """The quality of a stage's parts, whose number is `parts`; `tq` is None where a part has none."""
+
+    parts: int
+    tq: Spread | None
+
+
+class Quality(Measured):
+    """Trajectory quality and tiers of all parts: the document of `inspect quality --json`."""
+
+    stages: tuple[StageQuality, ...]
+    tasks: tuple[TaskQuality, ...]
 
 
 def measure_quality(dataset: Tables) -> Quality:
@@ -25,7 +107,8 @@ def measure_quality(dataset: Tables) -> Quality:
         0.9
     """
     tasks = tuple(_task_quality(dataset, task) for task in dataset.tasks)
-    return Quality(**heading(dataset), stages=tuple(_stages(tasks)), tasks=tasks)
+    rows = by_stage((task.split, row) for task in tasks for row in task.snapshots)
+    return Quality(**heading(dataset), stages=tuple(_stage(*stage) for stage in rows), tasks=tasks)
 
 
 def trajectory_quality(dataset: Tables, task: int) -> dict[PartKey, float]:
@@ -60,18 +143,82 @@ def _tier_parts(dataset: Tables, task: int, tier: Tier) -> set[PartKey]:
         return set()
 
 
-def _stages(tasks: Iterable[TaskQuality]) -> Iterable[StageQuality]:
-    found: dict[tuple[int, Split], list[float | None]] = {}
-    for task in tasks:
-        for snapshot in task.snapshots:
-            found.setdefault((snapshot.step, task.split), []).append(snapshot.tq)
-    for step, split in in_stage_order(found):
-        values = [value for value in found[step, split] if value is not None]
-        parts = len(found[step, split])
-        tq = spread(values) if len(values) == parts else None
-        yield StageQuality(step=step, split=split, parts=parts, tq=tq)
+def _stage(step: int, split: Split, rows: Sequence[SnapshotQuality]) -> StageQuality:
+    values = [row.tq for row in rows if row.tq is not None]
+    tq = spread(values) if len(values) == len(rows) else None
+    return StageQuality(step=step, split=split, parts=len(rows), tq=tq)
 
 
-def in_stage_order(stages: Iterable[tuple[int, Split]]) -> list[tuple[int, Split]]:
-    """Steps and splits ascending by step, training before test."""
-    return sorted(stages, key=lambda stage: (stage[0], SPLITS.index(stage[1])))
+def interquartile_mean(values: FloatArray) -> FloatArray:
+    """Mean along the last axis without the lowest and the highest quarter, sizes rounded down.
+
+    Source: Agarwal et al. (arXiv 2108.13264, section 4.3) recommend it beside the mean.
+    """
+    cut = values.shape[-1] // 4
+    kept = np.sort(values, axis=-1)[..., cut : values.shape[-1] - cut]
+    mean: FloatArray = kept.mean(axis=-1)
+    return mean
+
+
+def bootstrap_interval(
+    count: int, statistic: Callable[[npt.NDArray[np.intp]], FloatArray]
+) -> tuple[float | None, float | None]:
+    """The 95% percentile bootstrap interval of a statistic; None for both ends with fewer than FEWEST values.
+
+    Args:
+        count: number of values.
+        statistic: of resamples (resamples, count), which hold positions of values.
+    """
+    if count < FEWEST:
+        return None, None
+    resamples = np.random.default_rng(0).integers(count, size=(RESAMPLES, count))
+    low, high = np.quantile(statistic(resamples), ENDS)
+    return (float(low), float(high)) if np.isfinite([low, high]).all() else (None, None)
+
+
+def spread(values: Sequence[float]) -> Spread:
+    """Mean, interquartile mean with its interval, and range of at least one value."""
+    array = np.array(values, dtype=np.float64)
+    low, high = bootstrap_interval(len(array), lambda resamples: interquartile_mean(array[resamples]))
+    return Spread(
+        mean=float(array.mean()),
+        iqm=float(interquartile_mean(array)),
+        low=low,
+        high=high,
+        min=float(array.min()),
+        max=float(array.max()),
+    )
+
+
+def plot_quality(found: Quality, file: Path) -> None:
+    """Draws trajectory quality by step: a thin line per task, and the interquartile mean of each split.
+
+    Raises:
+        SelectionError: the file's name is none of a picture.
+    """
+    figure = new_figure(7.0, 4.2)
+    axes = figure.subplots()
+    for task in found.tasks:
+        points = [(row.step, row.tq) for row in task.snapshots if row.tq is not None]
+        steps, values = zip(*points, strict=True) if points else ((), ())
+        axes.plot(steps, values, color=COLORS[task.split], alpha=0.3, linewidth=0.8)
+    for split in COLORS:
+        _draw_split(axes, found, split)
+    for level in (0.0, 1.0):
+        axes.axhline(level, color="0.3", linestyle=":", linewidth=0.9)
+    label_axes(axes, title(found), STEPS_LABEL, TQ_LABEL)
+    axes.legend(fontsize="small")
+    save_figure(figure, file)
+
+
+def _draw_split(axes: "Axes", found: Quality, split: Split) -> None:
+    """The interquartile means of a split, with their interval where it is known."""
+    stages = [(stage.step, stage.tq) for stage in found.stages if stage.split == split and stage.tq]
+    if not stages:
+        return
+    steps, spreads = zip(*stages, strict=True)
+    label = f"{split}, interquartile mean and 95%"
+    axes.plot(steps, [tq.iqm for tq in spreads], "o-", color=COLORS[split], label=label)
+    if all(tq.low is not None for tq in spreads):
+        ends = ([tq.low for tq in spreads], [tq.high for tq in spreads])
+        axes.fill_between(steps, *ends, color=COLORS[split], alpha=0.25, linewidth=0)

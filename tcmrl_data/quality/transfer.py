@@ -2,10 +2,13 @@
 
 import contextlib
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.picture import new_figure, save_figure
+from tcmrl_data.dataset.returns import SPLITS
 from tcmrl_data.dataset.selection import chosen_parts
 from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.controller import BelievingController, Controller, DeterministicController
@@ -13,11 +16,9 @@ from tcmrl_data.envs.rollout import first_observation, hidden_entries, roll_out
 from tcmrl_data.envs.tasks import Split, Task, in_order
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
+from tcmrl_data.foundation.seeding import Purpose, evenly_spread, keyed_generator, keyed_seed
 from tcmrl_data.parts.worker import one_thread
-from tcmrl_data.quality.records import Transfer, TransferTask, heading
-from tcmrl_data.quality.scores import SPLITS
-from tcmrl_data.quality.steps import Progress, spread_tasks
+from tcmrl_data.quality.measured import TQ_LABEL, Measured, MeasuredTask, draw_matrix, heading, title
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 
 EPISODES = 5
@@ -33,6 +34,45 @@ Policy = Callable[[int], Controller]
 """Takes a number of lanes and gives a controller for one rollout in them."""
 
 
+class TransferTask(MeasuredTask):
+    """A row and a column of the matrix: a task and its last policy.
+
+    Attributes:
+        step: training steps of its policy.
+        run: the run that the policy is from.
+        uniform: mean return of uniform actions in the task, if it is known.
+        best: the best return that is known of the task: of the oracle, else the scripted expert, else its
+            best snapshot.
+    """
+
+    step: int
+    run: str
+    uniform: float | None
+    best: float
+
+
+class Transfer(Measured):
+    """Every last policy in every task: the document of `inspect transfer --json`.
+
+    Attributes:
+        seed: of the episodes.
+        episodes: of a policy in a task.
+        deterministic: whether policies act without their noise.
+        left_out: number of the dataset's tasks that take no part, because they are incomplete or too many.
+        tasks: rows and columns, training tasks first.
+        returns: row i, column j: mean return of the policy of task i in task j.
+        scores: the same in units of `tq`; None where the task has no references.
+    """
+
+    seed: int
+    episodes: int
+    deterministic: bool
+    left_out: int
+    tasks: tuple[TransferTask, ...]
+    returns: tuple[tuple[float, ...], ...]
+    scores: tuple[tuple[float | None, ...], ...]
+
+
 def measure_transfer(
     dataset: Dataset,
     *,
@@ -40,7 +80,7 @@ def measure_transfer(
     episodes: int = EPISODES,
     seed: int = 0,
     deterministic: bool = False,
-    progress: Progress = lambda done, total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Transfer:
     """Lets the last policy of every task act in every task.
 
@@ -113,7 +153,7 @@ def _chosen_tasks(dataset: Dataset, number: int) -> list[Task]:
     share = min(1.0, number / max(1, len(complete)))
     train, test = by_split["train"], by_split["test"]
     num_test = max(1, round(share * len(test))) if test else 0
-    chosen = [*spread_tasks(train, max(1, number - num_test)), *spread_tasks(test, num_test)]
+    chosen = [*evenly_spread(train, max(1, number - num_test)), *evenly_spread(test, num_test)]
     if len(chosen) < 2 or not train:
         raise SelectionError(
             f"{dataset.folder}: policies are compared between at least two complete tasks, one of them for "
@@ -148,7 +188,7 @@ def _play(
     *,
     episodes: int,
     seed: int,
-    progress: Progress,
+    progress: Callable[[int, int], None] | None,
 ) -> FloatArray:
     """Mean returns (policies, tasks); as many episodes as allowed are stepped together."""
     played = [(task, episode) for task in tasks for episode in range(episodes)]
@@ -176,7 +216,8 @@ def _play(
                 returns[row, start : start + len(chunk)] = [
                     trajectory.undiscounted_return for trajectory in trajectories
                 ]
-                progress(start * len(policies) + (row + 1) * len(chunk), len(played) * len(policies))
+                if progress:
+                    progress(start * len(policies) + (row + 1) * len(chunk), len(played) * len(policies))
     means: FloatArray = returns.reshape(len(policies), len(tasks), episodes).mean(axis=2)
     return means
 
@@ -193,3 +234,24 @@ def _score(value: float, task: TransferTask) -> float | None:
     if task.uniform is None or task.best <= task.uniform:
         return None
     return (value - task.uniform) / (task.best - task.uniform)
+
+
+def plot_transfer(found: Transfer, file: Path) -> None:
+    """Draws the matrix of scores, or of returns where a task has no references; a line parts the splits.
+
+    Raises:
+        SelectionError: the file's name is none of a picture.
+    """
+    figure = new_figure(6.4, 5.4)
+    axes = figure.subplots()
+    scored = all(score is not None for row in found.scores for score in row)
+    rows = [[score or 0.0 for score in row] for row in found.scores] if scored else found.returns
+    label = TQ_LABEL if scored else "mean undiscounted return"
+    draw_matrix(axes, rows, [task.task for task in found.tasks], label)
+    border = sum(task.split == "train" for task in found.tasks) - 0.5
+    if border < len(found.tasks) - 1:
+        axes.axhline(border, color="white", linewidth=1.2)
+        axes.axvline(border, color="white", linewidth=1.2)
+    axes.set(xlabel="task acted in (test tasks last)", ylabel="task of the policy")
+    axes.set_title(f"{title(found)}: last policies in all tasks")
+    save_figure(figure, file)

@@ -5,20 +5,17 @@ neighbours in (observation, action), once among transitions of the same task and
 tasks. If the same task predicts better, something that the observation does not show differs between tasks.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.envs.tasks import Split
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
-from tcmrl_data.quality.records import StageVisibility, TransferTask
-from tcmrl_data.quality.scores import in_stage_order
-from tcmrl_data.quality.steps import PartSteps, Progress, read_steps
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.quality.measured import SMALLEST_STD, MeasuredStage, PartSteps, by_stage, read_steps
+from tcmrl_data.quality.transfer import TransferTask
 
 NEIGHBOURS = 5
 """Nearest neighbours of a prediction."""
@@ -26,11 +23,25 @@ NEIGHBOURS = 5
 TRANSITIONS = 500
 """Most transitions of a part that are predicted, and most that predict, by default."""
 
-SMALLEST_STD = 1e-6
-"""Columns whose standard deviation is smaller do not vary."""
-
 SMALLEST_ERROR = 1e-12
 """Squared errors below this share of the mean square are zero but for rounding."""
+
+
+class StageVisibility(MeasuredStage):
+    """How visible the task is in the data of a stage.
+
+    Attributes:
+        tasks: number of tasks.
+        rewarded: share of steps with a reward other than zero.
+        reward: visibility in rewards: 1 − (squared error of predictions from the same task) / (from other
+            tasks). 1 is plain to see, 0 is invisible; None where rewards cannot be told apart at all.
+        dynamics: visibility in the changes of observations.
+    """
+
+    tasks: int
+    rewarded: float
+    reward: float | None
+    dynamics: float | None
 
 
 @dataclass(frozen=True)
@@ -67,7 +78,7 @@ def measure_visibility(
     *,
     transitions: int = TRANSITIONS,
     seed: int = 0,
-    progress: Progress = lambda done, total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[StageVisibility]:
     """How visible the task is at every step of some tasks' runs, training and test tasks apart.
 
@@ -83,20 +94,19 @@ def measure_visibility(
     Raises:
         StoreError: a part is damaged.
     """
-    stages: dict[tuple[int, Split], list[PartKey]] = {}
-    for task in tasks:
-        for key in dataset.parts.keys_of(task.task):
-            if key.run == task.run:
-                stages.setdefault((key.step, task.split), []).append(key)
-    done, total = 0, sum(map(len, stages.values()))
-    for step, split in in_stage_order(stages):
+    keys = [
+        (task.split, key) for task in tasks for key in dataset.parts.keys_of(task.task) if key.run == task.run
+    ]
+    done = 0
+    for step, split, members in by_stage(keys):
         samples = []
-        for key in stages[step, split]:
-            generator = keyed_generator(seed, dataset.name, key.task, Purpose.VISIBILITY, key.step)
+        for key in members:
+            generator = keyed_generator(seed, dataset.name, key.task, Purpose.VISIBILITY, step)
             sample = draw_sample(read_steps(dataset, key), transitions, generator)
             samples += [sample] if sample is not None else []
             done += 1
-            progress(done, total)
+            if progress:
+                progress(done, len(keys))
         if samples:
             generator = keyed_generator(seed, dataset.name, NO_TASK, Purpose.VISIBILITY, step)
             reward, dynamics = visibility(samples, generator)

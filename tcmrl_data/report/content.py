@@ -9,11 +9,10 @@ from tcmrl_data.dataset.returns import return_table, task_table
 from tcmrl_data.dataset.summary import dataset_summary
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.quality.coverage import measure_coverage
-from tcmrl_data.quality.records import Coverage, Quality, Rewards, Transfer
-from tcmrl_data.quality.rewards import measure_rewards
-from tcmrl_data.quality.scores import measure_quality
-from tcmrl_data.quality.transfer import measure_transfer
+from tcmrl_data.quality.coverage import Coverage, measure_coverage
+from tcmrl_data.quality.rewards import Rewards, measure_rewards
+from tcmrl_data.quality.scores import Quality, measure_quality
+from tcmrl_data.quality.transfer import Transfer, measure_transfer
 from tcmrl_data.report.evenly import evenly
 from tcmrl_data.report.excerpts import Browsed, Paths, browse
 from tcmrl_data.report.measures import Actions, Episodes, Visits

@@ -8,7 +8,7 @@ import numpy as np
 from tcmrl_data.dataset.returns import SPLITS
 from tcmrl_data.envs.tasks import Split
 from tcmrl_data.page.figures import Axis, Cells, Figure, Frame, Series
-from tcmrl_data.quality.records import Transfer
+from tcmrl_data.quality.transfer import Transfer
 from tcmrl_data.report.content import Content
 
 STEPS = "environment steps of behavior training"
