@@ -11,8 +11,7 @@ from tcmrl_data import Dataset, SelectionError, TcmrlError, measure_transfer, me
 from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
 from tcmrl_data.quality.measured import PartSteps
 from tcmrl_data.quality.transfer import Transfer, TransferTask
-from tcmrl_data.quality.visibility import Half, Sample, draw_sample, visibility
-from tcmrl_data.quality.worth import context_worth
+from tcmrl_data.quality.worth import Half, Sample, context_worth, draw_sample, visibility
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part_record import References
 from tests.commands import Call, assert_refused, in_process

@@ -12,6 +12,7 @@ import numpy as np
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.picture import check_picture, new_figure, save_figure
 from tcmrl_data.dataset.shift import shift_rows
+from tcmrl_data.envs.tasks import Split
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.store.part_table import PartEntry
@@ -19,7 +20,7 @@ from tcmrl_data.store.part_table import PartEntry
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-SPLITS = ("train", "test")
+SPLITS: tuple[Split, ...] = ("train", "test")
 RETURN_FIELDS = ("episodes", "steps", "mean", "std", "min", "max", "success_rate")
 
 

@@ -58,7 +58,6 @@ class SnapshotCoverage(MeasuredPart):
     """The coverage of a part.
 
     Attributes:
-        steps: number of environment steps.
         cells: number of different state-action cells.
         saco: `cells` as a share of the cells of all parts of the task.
         tq: trajectory quality, as in `SnapshotQuality`.
@@ -78,7 +77,7 @@ class TaskCoverage(MeasuredTask):
 
 
 class StageCoverage(MeasuredStage):
-    """Means over a stage's parts, whose number is `parts`."""
+    """Means over a stage's parts."""
 
     parts: int
     steps: float
@@ -105,9 +104,6 @@ class Coverage(Measured):
     Attributes:
         cell: width of a cell in standard deviations of each column.
         columns: number of observation and action columns that vary; the grid has as many dimensions.
-        stages: means by step and split.
-        tasks: every part.
-        overlap: of the states that tasks visit.
     """
 
     cell: float
@@ -131,7 +127,7 @@ def measure_coverage(
     Here pairs are cells, a dataset is a part, and the reference is all parts of its task together.
 
     Args:
-        dataset: the dataset; one part at a time is in memory.
+        dataset: one part at a time is in memory.
         cell: width of a cell in standard deviations.
         overlap_tasks: number of tasks in the matrix of overlaps.
         progress: called with parts done and parts in all.
@@ -172,14 +168,7 @@ def measure_coverage(
 
 @dataclass(frozen=True)
 class Grid:
-    """A grid over observations and actions.
-
-    Attributes:
-        observation_widths: (observation columns that vary,), widths of cells.
-        action_widths: (action columns that vary,).
-        observation_columns: positions of these columns.
-        action_columns: likewise.
-    """
+    """A grid over the columns of observations and actions that vary: their positions and widths of cells."""
 
     observation_widths: FloatArray
     action_widths: FloatArray
@@ -277,11 +266,7 @@ def _overlap(visited: dict[int, Cells]) -> Overlap:
 
 
 def plot_coverage(found: Coverage, file: Path) -> None:
-    """Draws coverage against trajectory quality, a line per split along the steps, and overlaps of tasks.
-
-    Raises:
-        SelectionError: the file's name is none of a picture.
-    """
+    """Draws coverage against trajectory quality, a line per split along the steps, and overlaps of tasks."""
     figure = new_figure(10.0, 4.4)
     left, right = figure.subplots(1, 2)
     for split, color in COLORS.items():

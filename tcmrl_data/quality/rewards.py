@@ -39,13 +39,9 @@ class SnapshotRewards(MeasuredPart):
     """The stored rewards of a part.
 
     Attributes:
-        steps: number of rewards.
         zero: share of rewards that are exactly zero.
         silent: share of episodes in which all rewards are zero.
-        mean: of the rewards.
-        std: of the rewards, the population's.
-        min: smallest reward.
-        max: largest reward.
+        std: the population's.
     """
 
     steps: int
@@ -68,10 +64,6 @@ class StageRewards(MeasuredStage):
 
     Attributes:
         parts: number of parts.
-        steps: number of rewards.
-        zero: as in `SnapshotRewards`; `silent` and `mean` likewise.
-        min: smallest reward.
-        max: largest reward.
         counts: number of rewards in every bin.
     """
 
@@ -91,8 +83,6 @@ class Rewards(Measured):
     Attributes:
         edges: borders of the bins, one more than bins. The first and the last bin also count what lies
             beyond, because the borders come from a sample of the parts.
-        stages: by step and split.
-        tasks: every part.
     """
 
     edges: tuple[float, ...]
@@ -106,7 +96,7 @@ def measure_rewards(
     """Histograms of stored rewards by step and split, and the share of zero rewards in every part.
 
     Args:
-        dataset: the dataset; one part at a time is in memory.
+        dataset: one part at a time is in memory.
         bins: number of bins, of equal width.
         progress: called with parts done and parts in all.
 
@@ -176,11 +166,7 @@ def _stage(step: int, split: Split, rows: Sequence[SnapshotRewards], counts: Cou
 
 
 def plot_rewards(found: Rewards, file: Path) -> None:
-    """Draws the distribution of rewards by step, training tasks, and the share of zero rewards.
-
-    Raises:
-        SelectionError: the file's name is none of a picture.
-    """
+    """Draws the distribution of rewards by step, training tasks, and the share of zero rewards."""
     figure = new_figure(10.0, 4.4)
     left, right = figure.subplots(1, 2)
     stages = [stage for stage in found.stages if stage.split == "train"] or list(found.stages)

@@ -43,12 +43,9 @@ class Spread(Record):
     """A quantity over several tasks.
 
     Attributes:
-        mean: of all.
         iqm: interquartile mean, without the lowest and the highest quarter.
         low: lower end of the 95% bootstrap interval of `iqm`; None with fewer than five values.
         high: upper end.
-        min: smallest value.
-        max: largest value.
     """
 
     mean: float
@@ -63,7 +60,6 @@ class SnapshotQuality(MeasuredPart):
     """The quality of a part.
 
     Attributes:
-        episodes: number of episodes.
         mean: mean undiscounted return.
         tq: trajectory quality: 0 is as good as uniform actions, 1 as the best that is known of the task.
         tiers: the quality tiers that take the part.
@@ -191,11 +187,7 @@ def spread(values: Sequence[float]) -> Spread:
 
 
 def plot_quality(found: Quality, file: Path) -> None:
-    """Draws trajectory quality by step: a thin line per task, and the interquartile mean of each split.
-
-    Raises:
-        SelectionError: the file's name is none of a picture.
-    """
+    """Draws trajectory quality by step: a thin line per task, and the interquartile mean of each split."""
     figure = new_figure(7.0, 4.2)
     axes = figure.subplots()
     for task in found.tasks:

@@ -38,8 +38,6 @@ class TransferTask(MeasuredTask):
     """A row and a column of the matrix: a task and its last policy.
 
     Attributes:
-        step: training steps of its policy.
-        run: the run that the policy is from.
         uniform: mean return of uniform actions in the task, if it is known.
         best: the best return that is known of the task: of the oracle, else the scripted expert, else its
             best snapshot.
@@ -55,9 +53,7 @@ class Transfer(Measured):
     """Every last policy in every task: the document of `inspect transfer --json`.
 
     Attributes:
-        seed: of the episodes.
         episodes: of a policy in a task.
-        deterministic: whether policies act without their noise.
         left_out: number of the dataset's tasks that take no part, because they are incomplete or too many.
         tasks: rows and columns, training tasks first.
         returns: row i, column j: mean return of the policy of task i in task j.
@@ -237,11 +233,7 @@ def _score(value: float, task: TransferTask) -> float | None:
 
 
 def plot_transfer(found: Transfer, file: Path) -> None:
-    """Draws the matrix of scores, or of returns where a task has no references; a line parts the splits.
-
-    Raises:
-        SelectionError: the file's name is none of a picture.
-    """
+    """Draws the matrix of scores, or of returns where a task has no references; a line parts the splits."""
     figure = new_figure(6.4, 5.4)
     axes = figure.subplots()
     scored = all(score is not None for row in found.scores for score in row)

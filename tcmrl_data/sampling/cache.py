@@ -155,9 +155,7 @@ def load_rows(
         say: called with a message if the cache is used.
 
     Raises:
-        CacheError: the rows fit neither into memory nor into the cache.
-        SelectionError: a part has no dense rewards.
-        StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
+        TcmrlError: as `read_rows` or `cached_rows` does.
     """
     rows, width = table_shape(selection, plan_rows(selection, dense=dense))
     needed = 4 * rows * width
@@ -179,7 +177,7 @@ def cached_rows(
 
     Args:
         selection: the selection.
-        dense: with dense rewards; they have an entry of their own.
+        dense: load dense rewards too; they have an entry of their own.
         say: called with a message before decoding, and before waiting, starts.
 
     Raises:

@@ -209,7 +209,7 @@ class Gatherer:
         request: the content of a batch.
         num_tasks: tasks per batch.
         device: device of the batches.
-        endings: endings of the rows by rewards; those of kinds that are requested with `returns=True`.
+        endings: by rewards, for the kinds that are requested with `returns=True`.
     """
 
     def __init__(

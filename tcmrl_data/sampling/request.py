@@ -30,14 +30,9 @@ class Trajectories:
     """Whole episodes, drawn uniformly from all episodes of a task, without replacement.
 
     Attributes:
-        numbers: episodes per task; one of these numbers is drawn for every batch.
+        numbers: episodes per task; of several numbers, one is drawn for every batch.
         apart_from: name of another kind of trajectories; a batch has no episode in both kinds.
-        returns: whether steps include returns to go, discounts, final observations and times.
-
-    Args:
-        numbers: one number or several numbers.
-        apart_from: as above.
-        returns: as above.
+        returns: as for `Transitions`.
     """
 
     rewards: ClassVar[Reward] = "stored"
@@ -54,7 +49,7 @@ class Trajectories:
 
     @property
     def number(self) -> int:
-        """The maximum number of episodes per task."""
+        """The largest number of episodes per task."""
         return max(self.numbers, default=0)
 
 
@@ -65,7 +60,7 @@ class Windows:
     Attributes:
         number: windows per task.
         length: transitions per window.
-        returns: whether steps include returns to go, discounts, final observations and times.
+        returns: as for `Transitions`.
     """
 
     rewards: ClassVar[Reward] = "stored"

@@ -78,8 +78,6 @@ class PackedRows:
     Attributes:
         table: (rows, observation_dim + action_dim + 2), or one column more with dense rewards.
         episodes: positions of the episodes in the table.
-        observation_dim: width of observations.
-        action_dim: width of actions.
         task_indices: (tasks,) indices of the tasks.
     """
 
@@ -106,16 +104,11 @@ class PackedRows:
 
 @dataclass(frozen=True)
 class PartRows:
-    """The rows of one part.
+    """Rows `first` to `last` - 1 of a table: those of one part, with dense rewards or without.
 
     Attributes:
-        dataset: the dataset.
-        key: the part.
         task: position of the part's task in the selection.
-        first: its first row.
-        last: its last row + 1.
-        episodes: number of its episodes.
-        dense: whether rows hold dense rewards.
+        episodes: number of the part's episodes.
     """
 
     dataset: "Dataset"
@@ -148,12 +141,7 @@ def table_shape(selection: "Selection", plan: Sequence[PartRows]) -> tuple[int, 
 
 
 def read_rows(selection: "Selection", *, dense: bool = False) -> PackedRows:
-    """Reads a selection into memory, with dense rewards or without.
-
-    Raises:
-        SelectionError: a part has no dense rewards.
-        StoreError: arrays cannot be decoded or do not form episodes; the message names the part.
-    """
+    """Reads a selection into memory, with dense rewards or without; raises what `fill_table` does."""
     plan = plan_rows(selection, dense=dense)
     table: Table = np.zeros(table_shape(selection, plan), dtype=np.float32)
     return pack_rows(selection, plan, table, fill_table(table, plan))
@@ -174,7 +162,7 @@ def fill_table(table: Table, plan: Sequence[PartRows], *, check_digests: bool = 
     Args:
         table: of the shape that `table_shape` gives.
         plan: the parts.
-        check_digests: hash the decoded arrays and compare them with the parts' records; for rows that others
+        check_digests: compare the decoded arrays with the digests of the parts' records; for rows that others
             receive under the parts' ids.
 
     Raises:
@@ -231,11 +219,7 @@ def _check_digests(part: PartRows, arrays: Arrays) -> None:
 
 
 def fill_rows(out: Table, arrays: Arrays) -> Indices:
-    """Writes a part's arrays into rows of zeros; returns the lengths of its episodes.
-
-    Args:
-        out: (observations, width), the part's rows.
-        arrays: the part's arrays.
+    """Writes a part's arrays into its rows (observations, width) of zeros; returns the episodes' lengths.
 
     Raises:
         StoreError: the arrays do not form episodes, or do not have the shape of `out`.
