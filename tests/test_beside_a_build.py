@@ -11,7 +11,7 @@ import pytest
 from tcmrl_data import Dataset, Recipe, build_status, open_dataset, verify_dataset
 from tcmrl_data.building import ledger
 from tcmrl_data.verification import verify
-from tcmrl_data.verification.scan import Scan, scan_dataset
+from tcmrl_data.verification.description import Scan, scan_dataset
 from tests.simulated_disk import PreparedParts
 
 RUNS = 20

@@ -17,7 +17,7 @@ from tcmrl_data.foundation.errors import (
 )
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST
-from tcmrl_data.verification.garbage import collect_garbage
+from tcmrl_data.verification.cleaning import collect_garbage
 from tests.damage import littered
 
 Copy = Callable[[], Path]

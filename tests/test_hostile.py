@@ -19,7 +19,7 @@ from tcmrl_cli.frame import run
 import tcmrl_data
 from tcmrl_data import TcmrlError, open_dataset, verify_dataset
 from tcmrl_data.verification import making_again
-from tcmrl_data.verification.findings import Finding
+from tcmrl_data.verification.description import Finding
 from tests.hostile.arrays import CHUNKS
 from tests.hostile.case import Case
 from tests.hostile.corpus import CASES, CORPUS

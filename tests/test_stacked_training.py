@@ -28,7 +28,7 @@ from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST
-from tcmrl_data.verification.garbage import collect_garbage
+from tcmrl_data.verification.cleaning import collect_garbage
 from tcmrl_data.verification.repair import repair_dataset
 from tests.datasets import part_ids
 from tests.training_of_behavior import Interrupted, assert_resumes, context_of

@@ -1,18 +1,120 @@
-"""The manifest and the tables of a dataset, read as far as they can be and compared with each other."""
+"""What a dataset says of itself, what lies in its folder, and what is found to be wrong with the two."""
 
-from collections.abc import Mapping
+import os
+import stat
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
+from tcmrl_data.building.work_files import WORK_FILES, WORK_FOLDERS
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.plain_files import words_after
+from tcmrl_data.foundation.plain_files import one_line, status_of, words_after
+from tcmrl_data.store.keys import PartKey, is_part_folder, key_of_file
 from tcmrl_data.store.manifest import MANIFEST, Manifest, TableSeal, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_parts
 from tcmrl_data.store.sealing import is_complete
 from tcmrl_data.store.tables import read_sealed
 from tcmrl_data.store.task_table import TASKS, parse_tasks
-from tcmrl_data.verification.findings import Finding, finding
+
+VerifyLevel = Literal["quick", "digests", "deep"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong.
+
+    Attributes:
+        file: path relative to the dataset; a folder where a whole folder is meant.
+        problem: what is wrong with it.
+        task: task of the part that it belongs to.
+        step: snapshot step of that part.
+        run: run of that part.
+        foreign: it belongs to nothing that the manifest names; repair leaves it alone.
+    """
+
+    file: str
+    problem: str
+    task: int | None = None
+    step: int | None = None
+    run: str | None = None
+    foreign: bool = False
+
+    @property
+    def key(self) -> PartKey | None:
+        """The part that a finding is about; None for other files, and for foreign ones."""
+        return None if self.foreign else key_of_file(self.file)
+
+
+def finding(file: str, problem: str, *, foreign: bool = False) -> Finding:
+    """A finding about a file, which may be a part's."""
+    key = key_of_file(file)
+    if key is None:
+        return Finding(file, problem, foreign=foreign)
+    return Finding(file, problem, key.task, key.step, key.run, foreign)
+
+
+MAX_DEPTH = 10
+"""Parts lie 3 folders deep."""
+
+
+@dataclass(frozen=True)
+class Scan:
+    """What lies in a folder, by relative path.
+
+    Attributes:
+        files: status of everything that is no folder, such as a link to a folder that parts do not lie in.
+        empty_folders: folders that hold nothing.
+        problems: folders that could not be listed, or lie too deep, and why.
+    """
+
+    files: dict[str, os.stat_result]
+    empty_folders: set[str]
+    problems: dict[str, str]
+
+    def paths(self) -> Iterator[str]:
+        """Every path found, in no order."""
+        yield from self.files
+        yield from self.empty_folders
+        yield from self.problems
+
+
+def scan_dataset(folder: Path, *, follow: bool = True) -> Scan:
+    """Lists a dataset, work files left out where they are of their kind.
+
+    Args:
+        folder: the dataset.
+        follow: list what links in the places of parts and tables lead to; else the links themselves.
+    """
+    scan = Scan({}, set(), {})
+    waiting = [""]
+    while waiting:
+        place = waiting.pop()
+        try:
+            with os.scandir(folder / place) as found:
+                entries = list(found)
+        except OSError as error:
+            scan.problems[place or "."] = f"cannot be listed ({one_line(error)})"
+            continue
+        if not entries and place:
+            scan.empty_folders.add(place)
+        for entry in entries:
+            path = f"{place}/{entry.name}" if place else entry.name
+            try:
+                status = status_of(entry) if follow else entry.stat(follow_symlinks=False)
+                if stat.S_ISDIR(status.st_mode) and entry.is_symlink() and not is_part_folder(path):
+                    status = entry.stat(follow_symlinks=False)  # it may lead to any folder, the root even
+            except FileNotFoundError:  # a build has renamed or removed it meanwhile
+                continue
+            is_folder = stat.S_ISDIR(status.st_mode)
+            if is_folder and path.count("/") >= MAX_DEPTH:
+                scan.problems[path] = "lies deeper than any folder of a dataset"
+            elif is_folder and path not in WORK_FOLDERS:
+                waiting.append(path)
+            elif not is_folder and not (path in WORK_FILES and stat.S_ISREG(status.st_mode)):
+                scan.files[path] = status
+    return scan
 
 
 @dataclass

@@ -19,7 +19,7 @@ from tcmrl_data.store.sealing import write_dataset
 from tcmrl_data.store.tables import read_lines, read_sealed
 from tcmrl_data.store.task_table import TASKS, parse_tasks
 from tcmrl_data.verification.contents import recipe_environment
-from tcmrl_data.verification.scan import scan_dataset
+from tcmrl_data.verification.description import scan_dataset
 
 
 def restore_tables(folder: Path, manifest: Manifest) -> None:

@@ -33,19 +33,16 @@ from tcmrl_data.store.manifest import (
 from tcmrl_data.store.part_record import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry
 from tcmrl_data.store.task_table import TASKS
-from tcmrl_data.verification.contents import task_problems
-from tcmrl_data.verification.derivations import derivation_problems
-from tcmrl_data.verification.description import Description
-from tcmrl_data.verification.findings import Finding, VerifyLevel, finding
-from tcmrl_data.verification.part_checks import PartChecks
+from tcmrl_data.verification.contents import PartChecks, task_problems
+from tcmrl_data.verification.description import Description, Finding, VerifyLevel, finding, scan_dataset
 from tcmrl_data.verification.replay import (
     Replay,
+    derivation_problems,
     derived_problems,
     files_of_parts,
     replay_part,
     spread_parts,
 )
-from tcmrl_data.verification.scan import scan_dataset
 
 
 @dataclass(frozen=True)
