@@ -1,7 +1,8 @@
 """`tcmrl-data verify`, `repair`, `gc` and `import-policy`."""
 
 import dataclasses
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +17,10 @@ from .places import DATASET_PATH
 from .progress import StageProgress
 
 if TYPE_CHECKING:
-    from tcmrl_data import BuildEvent, VerifyLevel
+    from tcmrl_data import BuildEvent, Finding, VerifyLevel
+
+MOST_LINES = 20
+"""Findings that are listed one by one; of more, kinds are."""
 
 DATASET = click.argument("dataset", type=DATASET_PATH)
 
@@ -39,6 +43,13 @@ DATASET = click.argument("dataset", type=DATASET_PATH)
     help="Also regenerate N parts from their snapshots and seeds, and compare them.",
 )
 @click.option(
+    "--sample",
+    type=click.IntRange(min=1),
+    metavar="N",
+    help="Open N parts, spread over the dataset; check name and size of the others.",
+)
+@click.option("--strict", is_flag=True, help="Files of others beside the data are problems too.")
+@click.option(
     "--source",
     "sources",
     multiple=True,
@@ -54,13 +65,15 @@ def verify(
     quick: bool,
     deep: bool,
     replay: int,
+    sample: int | None,
+    strict: bool,
     sources: tuple[Path, ...],
 ) -> None:
-    """Check DATASET, and list every damaged, missing or foreign file.
+    """Check DATASET, and list every damaged, missing or foreign file; of many alike, how many they are.
 
     By default every file is hashed. A replay must be equal bit for bit if CPU model, packages and physics
     are those of the original, else equal within a tolerance. The dataset is not changed. The exit code is
-    1 if a problem is found.
+    1 if a problem is found. A file of another program beside the data is a note, not a problem.
 
     \b
     Examples:
@@ -76,14 +89,20 @@ def verify(
             dataset,
             level=level,
             replay=replay,
+            sample=sample,
+            strict=strict,
             sources=sources,
             progress=lambda done, total: progress.update("verify", done=done, total=total, unit="parts"),
         )
     if as_json:
         print_json(dataclasses.asdict(report))
     else:
-        for finding in report.findings:
-            click.echo(f"{printable(finding.file)}: {printable(finding.problem)}")
+        for line in _lines(report.findings, report.parts):
+            click.echo(line)
+        for note in report.notes[:MOST_LINES]:
+            click.echo(f"note: {printable(note.file)}: {printable(note.problem)}")
+        if len(report.notes) > MOST_LINES:
+            click.echo(f"note: {len(report.notes) - MOST_LINES:,} more files belong to no part")
         for replayed in report.replays:
             differences = "; ".join(replayed.platform_differences)
             how = (
@@ -106,19 +125,40 @@ def verify(
 @click.command()
 @DATASET
 @click.option("--deep", is_flag=True, help="Check as `verify --deep` does.")
+@click.option(
+    "--from",
+    "copy",
+    type=click.Path(path_type=Path),
+    metavar="COPY",
+    help="Take parts from a copy of the dataset where it has them, by their digests.",
+)
+@click.option(
+    "--accept",
+    is_flag=True,
+    help="Make parts of another platform here and take them as they come out: the dataset gets a new root.",
+)
 @PROCESSES
 @output_options
-def repair(dataset: Path, as_json: bool, quiet: bool, deep: bool, workers: int | None) -> None:
+def repair(
+    dataset: Path,
+    as_json: bool,
+    quiet: bool,
+    deep: bool,
+    copy: Path | None,
+    accept: bool,
+    workers: int | None,
+) -> None:
     """Regenerate the damaged parts of DATASET.
 
     Parts are regenerated from the recipe and the seed in the manifest, and replace the damaged parts only
-    if they have the same ids. Foreign files are listed and kept. A damaged manifest.json cannot be
-    repaired: delete it and the part folders that `verify` lists, then run the original `tcmrl-data build`
-    again, which keeps all valid parts.
+    if they have the same ids. On another platform than theirs nothing is begun without --accept. Foreign
+    files are listed and kept. A damaged manifest.json cannot be repaired: delete it and the part folders
+    that `verify` lists, then run the original `tcmrl-data build` again, which keeps all valid parts.
 
     \b
-    Example:
+    Examples:
       tcmrl-data repair data/point-robot --workers 2
+      tcmrl-data repair data/point-robot --from /backup/point-robot
     """
     import tcmrl_data
 
@@ -127,6 +167,8 @@ def repair(dataset: Path, as_json: bool, quiet: bool, deep: bool, workers: int |
             dataset,
             level=_level(quick=False, deep=deep),
             workers=workers,
+            copy=copy,
+            accept=accept,
             progress=lambda event: _show(event, progress),
         )
     if as_json:
@@ -134,19 +176,29 @@ def repair(dataset: Path, as_json: bool, quiet: bool, deep: bool, workers: int |
     else:
         for key in report.repaired:
             click.echo(f"{key}: regenerated, same id")
+        for key in report.copied:
+            click.echo(f"{key}: taken from {printable(str(copy))}, same digest")
+        for key in report.accepted:
+            click.echo(f"{key}: regenerated, another id")
         for table in report.tables:
             click.echo(f"{table}: written again from the parts, same root")
         for finding in report.left:
             click.echo(f"{printable(finding.file)}: kept, {printable(finding.problem)}")
         click.echo(
-            f"{printable(str(report.dataset))}: {len(report.repaired):,} parts regenerated, "
+            f"{printable(str(report.dataset))}: {len(report.repaired) + len(report.accepted):,} parts "
+            f"regenerated, {f'{len(report.copied):,} copied, ' if report.copied else ''}"
             f"{len(report.tables):,} tables rewritten, {_count(report.left)} not repaired"
             f"{'; the folder cannot be written, and no write was needed' if report.read_only else ''}"
         )
     if report.failed:
         fail_incomplete(f"{report.failed[0]}; run the same command again to continue")
-    if report.left:
-        fail_incomplete(f"{report.dataset}: {_count(report.left)} that `repair` cannot resolve")
+    if report.accepted:
+        click.echo(
+            f"{printable(str(report.dataset))}: root {report.root} now; the manifest names the new parts"
+        )
+    left = [finding for finding in report.left if not finding.note]
+    if left:
+        fail_incomplete(f"{report.dataset}: {_count(left)} that `repair` cannot resolve")
 
 
 @click.command()
@@ -213,6 +265,25 @@ def _level(*, quick: bool, deep: bool) -> "VerifyLevel":
     if quick and deep:
         raise click.UsageError("--quick and --deep cannot be combined; pass one of them")
     return "quick" if quick else "deep" if deep else "digests"
+
+
+def _lines(findings: Sequence["Finding"], parts: int) -> Iterator[str]:
+    """The findings, or of many how many there are of every kind."""
+    missing = [finding for finding in findings if finding.problem == "is missing" and finding.key is not None]
+    if parts > 1 and len(missing) == parts:
+        yield f"all {parts:,} parts are missing: is the disk mounted?"
+        findings = [finding for finding in findings if finding.problem != "is missing" or finding.key is None]
+    if len(findings) <= MOST_LINES:
+        yield from (f"{printable(finding.file)}: {printable(finding.problem)}" for finding in findings)
+        return
+    kinds: dict[str, list[Finding]] = {}
+    for finding in findings:
+        kinds.setdefault(re.sub(r"[0-9]+", "N", finding.problem), []).append(finding)
+    for alike in sorted(kinds.values(), key=len, reverse=True)[:MOST_LINES]:
+        first = f"{printable(alike[0].file)}: {printable(alike[0].problem)}"
+        yield first if len(alike) == 1 else f"{first}; and {len(alike) - 1:,} more of the kind"
+    if len(kinds) > MOST_LINES:
+        yield f"and {len(kinds) - MOST_LINES:,} more kinds; --json lists all"
 
 
 def _count(findings: Sequence[object]) -> str:

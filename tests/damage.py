@@ -41,4 +41,4 @@ def data_files(folder: Path) -> list[Path]:
 
 
 def found(folder: Path) -> set[str]:
-    return {finding.file for finding in verify_dataset(folder).findings}
+    return {finding.file for finding in verify_dataset(folder, strict=True).findings}

@@ -255,8 +255,8 @@ def test_a_foreign_file_does_not_stop_a_build_and_is_verifys_to_name(
     (folder / "notes.md").write_text("mine")
     report = tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
     assert (report.built, report.present) == (0, 15)
-    (finding,) = tcmrl_data.verify_dataset(folder).findings
-    assert (finding.file, finding.foreign) == ("notes.md", True)
+    verified = tcmrl_data.verify_dataset(folder)
+    assert (verified.findings, [note.file for note in verified.notes]) == ((), ["notes.md"])
 
 
 def test_a_seed_beyond_int64_is_refused(tiny_recipe: Recipe, tmp_path: Path) -> None:

@@ -49,7 +49,7 @@ COMMANDS = [
     "list",
     "status",
     "gc --dry-run",
-    "verify --quiet",
+    "verify --quiet --strict",
 ]
 Findings = tuple[Finding, ...]
 opened: list[str] = []
@@ -103,9 +103,9 @@ def look(folder: Path) -> tuple[str, str]:
 def everything(folder: Path) -> tuple[str, str, Findings, Findings, Findings, dict[str, int]]:
     """All that only reads: stage and message of `look`, findings by level, and exit codes of the commands."""
     stage, message = look(folder)
-    quick = verify_dataset(folder, level="quick", replay=1).findings
-    digests = verify_dataset(folder).findings
-    deep = verify_dataset(folder, level="deep", replay=1).findings
+    quick = verify_dataset(folder, level="quick", replay=1, strict=True).findings
+    digests = verify_dataset(folder, strict=True).findings
+    deep = verify_dataset(folder, level="deep", replay=1, strict=True).findings
     codes = {command: run(data, [*command.split(), str(folder)]) for command in COMMANDS}
     return stage, message, quick, digests, deep, codes
 
@@ -194,7 +194,7 @@ def test_a_hostile_dataset_is_refused(forge: Forge, case: Case, capsys: pytest.C
     assert any(all(words in finding.problem for words in case.words) for finding in named), findings
     assert codes.pop("inspect tasks") == (2 if stage in ("open", "tables") else 0)
     assert codes.pop("list") == 0
-    assert codes.pop("verify --quiet") == (1 if digests else 0)
+    assert codes.pop("verify --quiet --strict") == (1 if digests else 0)
     assert {finding.file for finding in (*quick, *digests)} <= {finding.file for finding in findings}
     assert set(codes.values()) <= {0, 1, 2}
     assert "Traceback" not in printed.err

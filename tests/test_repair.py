@@ -22,13 +22,14 @@ from tcmrl_data.foundation.errors import (
     NondeterminismError,
 )
 from tcmrl_data.foundation.records import sealed
-from tcmrl_data.store import sealing
+from tcmrl_data.parts import rollouts
+from tcmrl_data.store import platform, sealing
 from tcmrl_data.store.keys import PARTS, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.tables import seal_of
 from tcmrl_data.store.task_table import TASKS
-from tcmrl_data.verification import making_again
+from tcmrl_data.verification import repair
 from tests.damage import data_files, found, ids_of, rot
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
@@ -176,16 +177,74 @@ def test_a_part_that_comes_out_differently_replaces_nothing(
     folder = tiny_copy()
     for step in (0, 100, 150):
         (folder / part_file(PartKey(3, step))).unlink()
-    build = making_again.build_dataset
+    build = repair.build_dataset
 
     def build_with_another_seed(*arguments: object, **options: object) -> object:
         return build(*arguments, **(options | {"seed": 1}))  # type: ignore[arg-type]
 
-    monkeypatch.setattr(making_again, "build_dataset", build_with_another_seed)
+    monkeypatch.setattr(repair, "build_dataset", build_with_another_seed)
     before = {path: path.read_bytes() for path in data_files(folder)}
     with pytest.raises(NondeterminismError, match="task 3, step 0, run main came out as"):
         repair_dataset(folder, workers=1)
     assert {path: path.read_bytes() for path in data_files(folder)} == before
+
+
+@pytest.fixture
+def another_processor(monkeypatch: pytest.MonkeyPatch) -> None:
+    """This machine has another processor than the one that made the parts."""
+    here = platform._machine()
+    monkeypatch.setattr(platform, "_machine", lambda: here | {"cpu": "another one"})
+
+
+@pytest.mark.usefixtures("another_processor")
+def test_on_another_platform_nothing_is_begun(tiny_copy: Copy, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tiny_copy()
+    (folder / part_file(PartKey(3, 0))).unlink()
+    monkeypatch.setattr(repair, "build_dataset", refuse_to_build)
+    text = "made on another platform .cpu .* another one here.*--from COPY.*--accept"
+    with pytest.raises(NondeterminismError, match=text):
+        repair_dataset(folder)
+    assert list((folder / STAGING).glob("*")) == []
+
+
+def test_parts_are_taken_from_a_copy_by_their_digests(
+    tiny_copy: Copy, tiny_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nothing is made again, so that no platform matters; what is damaged in the copy too stays."""
+    folder, copy = tiny_copy(), tiny_copy()
+    for key in (PartKey(0, 100), PartKey(3, 0)):
+        (folder / part_file(key)).unlink()
+    rot(copy / part_file(PartKey(3, 0)))
+    monkeypatch.setattr(repair, "build_dataset", refuse_to_build)
+    with pytest.raises(AssertionError, match="a build"):
+        repair_dataset(folder, copy=copy)
+    assert found(folder) == {part_file(PartKey(3, 0))}
+    report = repair_dataset(folder, copy=tiny_folder)
+    assert (report.copied, report.repaired, report.left) == ((PartKey(3, 0),), (), ())
+    assert report.root == read_manifest(tiny_folder).root
+    assert verify_dataset(folder, level="deep").findings == ()
+
+
+@pytest.mark.usefixtures("another_processor")
+def test_parts_that_come_out_otherwise_are_taken_and_the_manifest_says_so(
+    tiny_copy: Copy, tiny_folder: Path, tiny_recipe: tcmrl_data.Recipe, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, key = tiny_copy(), PartKey(3, 0)
+    (folder / part_file(key)).unlink()
+    drawn = rollouts.keyed_generator
+    monkeypatch.setattr(rollouts, "keyed_generator", lambda *words: drawn(*words[:-1], words[-1] + 100))
+    report = repair_dataset(folder, accept=True)
+    assert (report.accepted, report.repaired, report.left) == ((key,), (), ())
+    assert report.root == read_manifest(folder).root != read_manifest(tiny_folder).root
+    assert read_manifest(folder).runs[0].origin == {"replaced": [str(key)]}
+    assert verify_dataset(folder, level="deep").findings == ()
+    tasks = [task.index for task in open_dataset(folder).tasks]
+    assert tcmrl_data.build_dataset(tiny_recipe, folder, tasks=tasks).built == 0
+    assert read_manifest(folder).runs[0].origin == {"replaced": [str(key)]}
+
+
+def refuse_to_build(*arguments: object, **options: object) -> None:
+    raise AssertionError("a build")
 
 
 @pytest.mark.parametrize("damage", [None, b"rot", b"{}\n"])

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tcmrl_cli import verification as verification_commands
+from tcmrl_cli.data import data
 
 from tcmrl_data import verify_dataset
 from tcmrl_data.building.events import EVENTS
@@ -25,6 +27,7 @@ from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.tables import read_lines
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import replay as replay_module
+from tests.commands import in_process
 from tests.damage import data_files, found, rot
 from tests.hostile.datasets import PART, STEP, Forge, base
 
@@ -244,3 +247,72 @@ def test_a_replay_needs_no_behavior_source(tiny_copy: Copy) -> None:
     with Archive(folder / part_file(key)) as archive:
         replay = replay_module.replay_part(archive, read_part_record(archive), key, recipe)
     assert replay.problems == ()
+
+
+BESIDE = (
+    "NOTES.md",
+    ".DS_Store",
+    "parts/._x.zip",
+    ".git/objects/pack",
+    ".nfs0001",
+    "data.dvc",
+    "parts/Thumbs.db",
+)
+
+
+def test_files_of_others_beside_the_data_are_notes(
+    tiny_copy: Copy, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tiny_copy()
+    for name in BESIDE:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text("mine")
+    report = verify_dataset(folder, level="deep")
+    expected = {".git" if name.startswith(".git") else name for name in BESIDE}
+    assert (report.findings, {note.file for note in report.notes}) == ((), expected)
+    strict = verify_dataset(folder, strict=True)
+    assert ({finding.file for finding in strict.findings}, strict.notes) == (expected, ())
+    run = in_process(data, capsys)
+    code, printed, _ = run("verify", folder)
+    assert code == 0 and "note: .DS_Store: belongs to no part" in printed
+    assert run("verify", folder, "--strict")[0] == 1
+    odd = f"{part_folder(PartKey(0, 0))}/150.zip"
+    (folder / odd).write_text("mine")
+    assert [found.file for found in verify_dataset(folder).findings] == [odd]
+
+
+def test_a_disk_that_is_not_mounted_is_one_line(tiny_copy: Copy, capsys: pytest.CaptureFixture[str]) -> None:
+    folder, run = tiny_copy(), in_process(data, capsys)
+    shutil.rmtree(folder / "parts")
+    code, printed, _ = run("verify", folder)
+    first, summary = printed.splitlines()
+    assert (code, first) == (1, "all 15 parts are missing: is the disk mounted?")
+    assert summary.endswith("15 findings")
+
+
+def test_many_findings_are_told_by_their_kinds(
+    tiny_copy: Copy, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, run = tiny_copy(), in_process(data, capsys)
+    monkeypatch.setattr(verification_commands, "MOST_LINES", 3)
+    first, *others = sorted((folder / "parts").rglob("*.zip"))
+    first.write_bytes(first.read_bytes()[:-1])
+    for file in others[:9]:
+        file.unlink()
+    lines = run("verify", folder)[1].splitlines()
+    assert len(lines) == 3
+    assert lines[0].endswith("is missing; and 8 more of the kind")
+    assert " bytes instead of " in lines[1]
+
+
+def test_a_sample_opens_some_parts_and_looks_for_all(tiny_copy: Copy) -> None:
+    folder = tiny_copy()
+    files = sorted((folder / "parts").rglob("*.zip"))
+    for file in (files[0], files[1]):
+        content = bytearray(file.read_bytes())
+        content[len(content) // 2] ^= 1
+        file.write_bytes(content)
+    files[2].unlink()
+    found = {folder / finding.file for finding in verify_dataset(folder, sample=2).findings}
+    assert found == {files[0], files[2]}
+    assert {folder / finding.file for finding in verify_dataset(folder).findings} == set(files[:3])

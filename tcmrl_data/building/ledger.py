@@ -204,7 +204,14 @@ class Ledger:
     def _manifest(self) -> bytes:
         """The manifest of what is there."""
         plan, earlier = self.plan, self._earlier
-        main = Run(name=MAIN_RUN, kind="built", seed=plan.seed, recipe=plan.recipe, steps=plan.source.steps)
+        main = Run(
+            name=MAIN_RUN,
+            kind="built",
+            seed=plan.seed,
+            recipe=plan.recipe,
+            origin=earlier.runs[0].origin if earlier else None,
+            steps=plan.source.steps,
+        )
         runs = [main, *(earlier.runs[1:] if earlier else ())]
         return manifest_bytes(
             name=plan.environment.name,

@@ -252,6 +252,17 @@ class Operation(abc.ABC, Generic[OperationSettings]):
         """
         return settings
 
+    @classmethod
+    def settings_of(cls, run: Run, source: Run) -> Mapping[str, Any]:
+        """What the settings of a run's parts have in common, as the manifest says.
+
+        Args:
+            run: of the parts.
+            source: of the parts that they are made from.
+        """
+        settings: Mapping[str, Any] = (run.origin or {}).get("settings", {})
+        return settings
+
     def derived(self, source: PartRecord) -> dict[str, Any] | None:
         """What the identity says of how the part is made from another; None for one made from none."""
         settings = self.settings.model_dump(mode="json")

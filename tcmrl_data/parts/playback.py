@@ -49,6 +49,11 @@ class Relabel(Operation[RelabelSettings]):
         """The settings with the task of the episodes."""
         return {"task": source.index, **settings}
 
+    @classmethod
+    def settings_of(cls, run: Run, source: Run) -> Mapping[str, Any]:
+        """The first episode of the parts that are relabelled."""
+        return {"first_episode": first_episode_of(source)}
+
     def episodes(self, wanted: WantedPart, sources: Sources) -> list[Trajectory]:
         """The episodes of the part with the rewards of the wanted part's task.
 
@@ -83,6 +88,11 @@ class Relabel(Operation[RelabelSettings]):
     def seeded_as(self, task: int, number: int, run: Run) -> tuple[int, int]:
         """Episodes start as those of the task that they come from."""
         return self.settings.task, self.settings.first_episode + number
+
+
+def first_episode_of(run: Run) -> int:
+    """Number of the first episode of a run's parts: 0, but for extended ones."""
+    return int((run.origin or {}).get("first_episode", 0))
 
 
 def _check_equal(old: Trajectory, new: Trajectory, part: str, episode: int, target: Task) -> None:

@@ -83,6 +83,11 @@ class Extend(Operation[ExtendSettings]):
         """The settings with the policy's task."""
         return {"task": source.index, "parameters": dict(source.parameters), **settings}
 
+    @classmethod
+    def settings_of(cls, run: Run, source: Run) -> Mapping[str, Any]:
+        """First episode and noise, as the run's origin says."""
+        return {name: (run.origin or {}).get(name) for name in ("first_episode", "noise")}
+
     def episodes(self, wanted: WantedPart, sources: Sources) -> list[Trajectory]:
         """As many episodes as the recipe says, from `first_episode` on."""
         settings = self.settings

@@ -7,7 +7,7 @@ from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import BuildError, SelectionError
 from tcmrl_data.foundation.records import Record, count_ranges, read_ranges, write_ranges
 from tcmrl_data.parts.operation import Operation, Sources, WantedPart
-from tcmrl_data.parts.playback import RELABEL
+from tcmrl_data.parts.playback import RELABEL, first_episode_of
 from tcmrl_data.store.limits import MAX_COUNT
 from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part_record import STANDARD_ARRAYS, Identity, PartRecord
@@ -93,11 +93,6 @@ class Cut(Operation[CutSettings]):
     def _cut_from(self, origin: str) -> dict[str, Any]:
         settings = self.settings.model_dump(mode="json")
         return {"operation": SUBSET, "from": [origin], "settings": settings}
-
-
-def first_episode_of(run: Run) -> int:
-    """Number of the first episode of a run's parts: 0, but for extended ones."""
-    return int((run.origin or {}).get("first_episode", 0))
 
 
 def read_cut(identity: Identity) -> tuple[str, Cut]:

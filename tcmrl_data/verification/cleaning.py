@@ -183,7 +183,7 @@ def delete_dataset(path: str | Path, *, dry_run: bool = False) -> Deletion:
 def _deletion(folder: Path, scan: Scan) -> Deletion:
     own = [status.st_size for file, status in scan.files.items() if _is_own(file, status.st_mode)]
     kept = [file for file, status in scan.files.items() if not _is_own(file, status.st_mode)]
-    return Deletion(folder, len(own), sum(own), tuple(sorted([*kept, *scan.problems])))
+    return Deletion(folder, len(own), sum(own), tuple(sorted([*kept, *scan.problems, *scan.hidden])))
 
 
 def _is_own(file: str, mode: int) -> bool:

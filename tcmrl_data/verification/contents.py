@@ -29,6 +29,8 @@ from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification.description import Description, VerifyLevel
 from tcmrl_data.verification.replay import origin_problem
 
+MISSING = "is missing"
+
 
 class PartChecks:
     """Checks of the parts of a dataset; threads may share them.
@@ -46,24 +48,28 @@ class PartChecks:
         self._settings = {run.name: run.recipe.unit_settings() for run in runs if run.recipe is not None}
         self._tasks = {task.index: task for task in description.tasks}
 
-    def problems(self, file: str, status: os.stat_result | None, entry: PartEntry | None) -> Iterator[str]:
+    def problems(
+        self, file: str, status: os.stat_result | None, entry: PartEntry | None, *, opened: bool = True
+    ) -> Iterator[str]:
         """Yields what is wrong with a part.
 
         Args:
             file: its path relative to the dataset.
             status: its status; None where it is missing.
             entry: its line in the table; None where the table cannot tell.
+            opened: whether its archive is looked into.
         """
         if status is None:
             blocked = folder_problem(self._folder, file.rpartition("/")[0])
-            yield f"cannot be reached: {blocked[0]} {blocked[1]}" if blocked else "is missing"
+            in_the_way = blocked is not None and os.path.lexists(self._folder / blocked[0])
+            yield f"cannot be reached: {blocked[0]} {blocked[1]}" if blocked and in_the_way else MISSING
             return
         odd = file_problem(status)
         if odd is not None:
             yield odd
         elif entry is not None and status.st_size != entry.size:
             yield f"has {status.st_size} bytes instead of {entry.size}"
-        elif self._level != "quick":
+        elif self._level != "quick" and opened:
             try:
                 with Archive(self._folder / file) as archive:
                     yield from self._archive_problems(archive, entry)

@@ -32,6 +32,7 @@ class Finding:
         step: snapshot step of that part.
         run: run of that part.
         foreign: it belongs to nothing that the manifest names; repair leaves it alone.
+        note: a file of somebody else beside the data, such as `.DS_Store`, which harms nothing.
     """
 
     file: str
@@ -40,6 +41,7 @@ class Finding:
     step: int | None = None
     run: str | None = None
     foreign: bool = False
+    note: bool = False
 
     @property
     def key(self) -> PartKey | None:
@@ -47,11 +49,11 @@ class Finding:
         return None if self.foreign else key_of_file(self.file)
 
 
-def finding(file: str, problem: str, *, foreign: bool = False) -> Finding:
+def finding(file: str, problem: str, *, foreign: bool = False, note: bool = False) -> Finding:
     """A finding about a file, which may be a part's."""
     key = key_of_file(file)
     if key is None:
-        return Finding(file, problem, foreign=foreign)
+        return Finding(file, problem, foreign=foreign, note=note)
     return Finding(file, problem, key.task, key.step, key.run, foreign)
 
 
@@ -67,11 +69,13 @@ class Scan:
         files: status of everything that is no folder, such as a link to a folder that parts do not lie in.
         empty_folders: folders that hold nothing.
         problems: folders that could not be listed, or lie too deep, and why.
+        hidden: folders of others, such as `.git`, which are left alone.
     """
 
     files: dict[str, os.stat_result]
     empty_folders: set[str]
     problems: dict[str, str]
+    hidden: set[str]
 
     def paths(self) -> Iterator[str]:
         """Every path found, in no order."""
@@ -87,7 +91,7 @@ def scan_dataset(folder: Path, *, follow: bool = True) -> Scan:
         folder: the dataset.
         follow: list what links in the places of parts and tables lead to; else the links themselves.
     """
-    scan = Scan({}, set(), {})
+    scan = Scan({}, set(), {}, set())
     waiting = [""]
     while waiting:
         place = waiting.pop()
@@ -108,7 +112,9 @@ def scan_dataset(folder: Path, *, follow: bool = True) -> Scan:
             except FileNotFoundError:  # a build has renamed or removed it meanwhile
                 continue
             is_folder = stat.S_ISDIR(status.st_mode)
-            if is_folder and path.count("/") >= MAX_DEPTH:
+            if is_folder and entry.name.startswith(".") and path not in WORK_FOLDERS:
+                scan.hidden.add(path)
+            elif is_folder and path.count("/") >= MAX_DEPTH:
                 scan.problems[path] = "lies deeper than any folder of a dataset"
             elif is_folder and path not in WORK_FOLDERS:
                 waiting.append(path)

@@ -1,15 +1,16 @@
 """Repair: parts that verification rejects are made again, checked by their ids, and put in their places."""
 
+import contextlib
 import stat
 import uuid
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_data.building.build import build_dataset
 from tcmrl_data.building.events import BuildEvent
 from tcmrl_data.building.work_files import check_work_files
-from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
@@ -20,10 +21,16 @@ from tcmrl_data.foundation.disk import (
     remove_tree,
     replace_file,
 )
-from tcmrl_data.foundation.errors import BuildError, NondeterminismError, ReadOnlyError, StoreError
+from tcmrl_data.foundation.errors import (
+    BuildError,
+    NondeterminismError,
+    ReadOnlyError,
+    SelectionError,
+    StoreError,
+)
 from tcmrl_data.foundation.plain_files import folder_problem, read_plain_file
-from tcmrl_data.parts.making import Published, numbered, read_published
-from tcmrl_data.parts.rollouts import EXTEND
+from tcmrl_data.parts.making import Published, numbered, operation_of_run, read_published
+from tcmrl_data.parts.operation import can_be_made_again
 from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
@@ -36,6 +43,7 @@ from tcmrl_data.store.manifest import (
     restore_manifest,
 )
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
+from tcmrl_data.store.platform import Platform, this_platform
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification.description import Finding, VerifyLevel
 from tcmrl_data.verification.tables import restore_tables, write_tables
@@ -55,6 +63,9 @@ class RepairReport:
         left: findings that a repair leaves to people: foreign files, and values of the manifest.
         failed: one line per task that could not be made again; the dataset is then as it was.
         read_only: the folder cannot be written, and nothing had to be.
+        copied: keys of the parts that were taken from the copy.
+        accepted: keys of the parts that were made again and came out with other ids.
+        root: of the dataset as it now stands.
     """
 
     dataset: Path
@@ -63,6 +74,9 @@ class RepairReport:
     left: tuple[Finding, ...]
     failed: tuple[str, ...]
     read_only: bool
+    copied: tuple[PartKey, ...] = ()
+    accepted: tuple[PartKey, ...] = ()
+    root: str | None = None
 
 
 def repair_dataset(
@@ -70,19 +84,25 @@ def repair_dataset(
     *,
     level: VerifyLevel = "digests",
     workers: int | None = None,
+    copy: str | Path | None = None,
+    accept: bool = False,
     progress: Callable[[BuildEvent], None] = lambda event: None,
 ) -> RepairReport:
-    """Makes the parts that verification rejects again, and only these, with the manifest's recipes and seeds.
+    """Makes the parts that verification rejects again, and only these, by their operations.
 
-    Built parts are built, extended ones made from the policies of other parts. New parts replace old ones
-    only when all of their kind are made and have the ids of the table; until then the dataset is not touched.
-    Damaged tables are written again from the parts, if these have the manifest's root. Foreign files stay
-    and are named.
+    Built parts are built with the manifest's recipes and seeds, others made from the parts that they name as
+    their sources. New parts replace old ones only when all of their run are made and have the ids of the
+    table; until then the dataset is not touched. Damaged tables are written again from the parts, if these
+    have the manifest's root. Foreign files stay and are named.
 
     Args:
         path: the dataset's folder or its `manifest.json`.
         level: level of the verification that selects the parts.
         workers: units run at the same time.
+        copy: a dataset that holds some of the parts too; those are taken from it, if they have the digests
+            of the table.
+        accept: also make parts again whose platform is another one than this, and take them as they come out.
+            The dataset then has another root, and the origin of its first run says which parts are new.
         progress: called with the events of the build.
 
     Raises:
@@ -91,29 +111,40 @@ def repair_dataset(
         BuildError: the tables are damaged and the parts do not have the manifest's root.
         LockedError: another process works on the dataset.
         ReadOnlyError: the folder cannot be written, and something is damaged.
-        NondeterminismError: a part came out with another id; nothing was replaced.
+        NondeterminismError: without `accept`, a part was made on another platform, so that nothing was begun,
+            or came out with another id, so that nothing was replaced.
     """
     folder = dataset_folder(path)
     if not (folder / MANIFEST_COPY).exists():
         read_manifest(folder)
     check_work_files(folder, but=(TASKS, PARTS_TABLE))
     try:
-        return _repair(folder, level=level, workers=workers, progress=progress)
+        with lock_file(folder / LOCK, f"dataset {folder}"):
+            return _Repair(folder, accept=accept, workers=workers, progress=progress).run(level, copy)
     except ReadOnlyError:
         findings = verify_dataset(folder, level=level).findings
         if any(not finding.foreign for finding in findings):
             raise
-        return RepairReport(folder, (), (), findings, (), read_only=True)
+        return RepairReport(folder, (), (), findings, (), read_only=True, root=read_manifest(folder).root)
 
 
-def _repair(
-    folder: Path,
-    *,
-    level: VerifyLevel,
-    workers: int | None,
-    progress: Callable[[BuildEvent], None],
-) -> RepairReport:
-    with lock_file(folder / LOCK, f"dataset {folder}"):
+class _Repair:
+    """One repair of a dataset; its lock is held."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        accept: bool,
+        workers: int | None,
+        progress: Callable[[BuildEvent], None],
+    ) -> None:
+        self._folder, self._accept, self._workers, self._progress = folder, accept, workers, progress
+        self._accepted: list[PartKey] = []
+
+    def run(self, level: VerifyLevel, copy: str | Path | None) -> RepairReport:
+        """Repairs tables, then parts; arguments and errors as of `repair_dataset`."""
+        folder = self._folder
         remove_abandoned(folder)
         restored = (MANIFEST,) if restore_manifest(folder) else ()
         findings = find_problems(folder, level)
@@ -121,81 +152,161 @@ def _repair(
         if damaged:
             restore_tables(folder, read_manifest(folder))
             findings = find_problems(folder, level)
-        keys = tuple(sorted({finding.key for finding in findings if finding.key is not None}))
-        failed: tuple[str, ...] = ()
-        if keys:
-            failed = _replace_parts(folder, keys, workers, progress)
+        keys = sorted({finding.key for finding in findings if finding.key is not None})
+        copied = _copy_parts(self._dataset(), keys, copy) if copy is not None else []
+        keys = [key for key in keys if key not in copied]
+        failed = self._make_parts(keys) if keys else ()
         remove_tree(folder / STAGING / REPAIR)
-        left = find_problems(folder, level)
-    tables = (*restored, *damaged)
-    return RepairReport(folder, () if failed else keys, tables, left, failed, read_only=False)
+        repaired = () if failed else tuple(key for key in keys if key not in self._accepted)
+        return RepairReport(
+            folder,
+            repaired,
+            (*restored, *damaged),
+            find_problems(folder, level),
+            failed,
+            read_only=False,
+            copied=tuple(copied),
+            accepted=tuple(self._accepted),
+            root=read_manifest(folder).root,
+        )
+
+    def _dataset(self) -> Dataset:
+        """The dataset as it now stands."""
+        return Dataset(self._folder, read_manifest(self._folder))
+
+    def _make_parts(self, keys: Sequence[PartKey]) -> tuple[str, ...]:
+        """Makes parts again and puts them in their places: built ones first, then what was made from them.
+
+        Returns:
+            One line per failure; the parts of that run, and of later ones, are then as they were.
+        """
+        dataset = self._dataset()
+        runs = {run.name: run for run in dataset.manifest.runs}
+        for key in keys:
+            problem = _lasting_damage(dataset, runs.get(key.run), key)
+            if problem:
+                return (f"{self._folder}: {problem}; take it from a copy of the dataset with --from COPY",)
+        if not self._accept:
+            _check_platforms(dataset, runs, keys)
+        for run in sorted(runs.values(), key=lambda run: run.kind != "built"):
+            chosen = [key for key in keys if key.run == run.name]
+            if chosen:
+                dataset, target = self._dataset(), self._folder / STAGING / REPAIR / run.name
+                if run.kind == "built":
+                    failed = _build_again(dataset, run, chosen, target, self._workers, self._progress)
+                    made = {key: target / part_file(PartKey(key.task, key.step)) for key in chosen}
+                else:
+                    failed = _derive_again(dataset, run, chosen, target, self._workers)
+                    made = {key: target / part_file(key) for key in chosen}
+                if failed:
+                    return failed
+                self._put_in_place(dataset, made)
+        return ()
+
+    def _put_in_place(self, dataset: Dataset, made: Mapping[PartKey, Path]) -> None:
+        """Replaces parts by new ones, if all have the ids of the table, or other ids are accepted."""
+        folder = self._folder
+        published = [read_published(file, key.run)[0] for key, file in made.items()]
+        other = []
+        for part in published:
+            recorded = dataset.recorded_parts.entry(part.entry.key)
+            assert recorded is not None
+            if part.entry.id != recorded.id and not self._accept:
+                raise NondeterminismError(
+                    f"{folder}: the part of {part.entry.key} came out as {part.entry.id}, the table has "
+                    f"{recorded.id}; repair on the platform that `tcmrl-data show` names, take the part from "
+                    "a copy with --from COPY, or take the new one with --accept"
+                )
+            if part.entry.id != recorded.id:
+                other.append(part.entry.key)
+        for key, file in made.items():
+            _put(folder, key, file.read_bytes())
+        _record(dataset, published, accepted=other)
+        self._accepted += other
 
 
-def _replace_parts(
-    folder: Path, keys: Sequence[PartKey], workers: int | None, progress: Callable[[BuildEvent], None]
-) -> tuple[str, ...]:
-    """Makes parts again and puts them in their places: built ones first, then what was made from them.
+def _lasting_damage(dataset: Dataset, run: Run | None, key: PartKey) -> str | None:
+    """Why a part cannot be made again from what the dataset holds; None if it can."""
+    if run is None:
+        return f"the manifest has no run {key.run}, of which the part of {key} is"
+    if not can_be_made_again(run):
+        return f"the part of {key} was not built here, run {run.name} is {run.kind}"
+    if run.kind != "built" and dataset.recorded_parts.entry(_source_of(run, key)) is None:
+        return f"the part that the one of {key} was made from is not in this dataset"
+    return None
 
-    Returns:
-        One line per failure; the parts of that kind of run, and of later kinds, are then as they were.
+
+def _source_of(run: Run, key: PartKey) -> PartKey:
+    """The part that a part of a derived run was made from."""
+    return PartKey(run.source_of(key.task), key.step, str((run.origin or {}).get("of", MAIN_RUN)))
+
+
+def _check_platforms(dataset: Dataset, runs: Mapping[str, Run], keys: Sequence[PartKey]) -> None:
+    """Refuses to make parts of another platform again, before the work.
 
     Raises:
-        NondeterminismError: a part came out with another id; no part of that kind of run was replaced.
+        NondeterminismError: names the first part, what differs, and what helps.
     """
-    runs = {run.name: run for run in read_manifest(folder).runs}
+    here: dict[str, Platform] = {}
+    simulating = {name for name in {key.run for key in keys} if operation_of_run(runs[name]).simulates}
     for key in keys:
-        problem = lasting_damage(runs.get(key.run), key)
-        if problem:
-            return (f"{folder}: {problem}; restore it from a copy",)
-    for kind in ("built", "extended"):
-        dataset = Dataset(folder, read_manifest(folder))
-        made: dict[PartKey, Path] = {}
-        for run in runs.values():
-            chosen = [key for key in keys if key.run == run.name and run.kind == kind]
-            if not chosen:
-                continue
-            target = folder / STAGING / REPAIR / run.name
-            if kind == "built":
-                failed = build_again(dataset, run, chosen, target, workers, progress)
-            else:
-                failed = extend_again(dataset, run, chosen, target, workers)
-            if failed:
-                return failed
-            made |= {key: made_file(target, run, key) for key in chosen}
-        _put_in_place(dataset, made)
-    return ()
-
-
-def _put_in_place(dataset: Dataset, made: dict[PartKey, Path]) -> None:
-    """Replaces parts by new ones, if all have the ids of the table."""
-    folder = dataset.folder
-    published = [read_published(file, key.run)[0] for key, file in made.items()]
-    for part in published:
-        recorded = dataset.recorded_parts.entry(part.entry.key)
-        assert recorded is not None
-        if part.entry.id != recorded.id:
+        recipe, entry = runs[key.run].recipe, dataset.recorded_parts.entry(key)
+        if key.run not in simulating or recipe is None or entry is None:
+            continue
+        if key.run not in here:
+            here[key.run] = this_platform(recipe.make_environment(), recipe.behavior.source)
+        differences = here[key.run].differences(dataset.manifest.platforms[entry.platform])
+        if differences:
             raise NondeterminismError(
-                f"{folder}: the part of {part.entry.key} came out as {part.entry.id}, the table has "
-                f"{recorded.id}; repair on the platform that `tcmrl-data show` names"
+                f"{dataset.folder}: the part of {key} was made on another platform "
+                f"({'; '.join(differences)[:200]}), where the same seeds give other episodes; repair there, "
+                "take it from a copy of the dataset with --from COPY, or make it here with --accept, which "
+                "gives the dataset another root"
             )
-    for key, file in made.items():
-        _clear(folder, part_file(key))
-        replace_file(folder / part_file(key), file.read_bytes(), staging=folder / STAGING)
-    _record(dataset, published)
 
 
-def _record(dataset: Dataset, parts: Sequence[Published]) -> None:
+def _copy_parts(dataset: Dataset, keys: Sequence[PartKey], copy: str | Path) -> list[PartKey]:
+    """Takes parts from another dataset that holds them with the digests of the table; returns their keys.
+
+    Raises:
+        ManifestError: there is no dataset at `copy`.
+    """
+    other = open_dataset(copy)
+    places = {entry.sha256: entry.key for entry in other.recorded_parts.entries()}
+    taken = []
+    for key in keys:
+        wanted = dataset.recorded_parts.entry(key)
+        place = None if wanted is None else places.get(wanted.sha256)
+        if place is not None:
+            with contextlib.suppress(SelectionError, StoreError):  # damaged there too
+                _put(dataset.folder, key, other.content(place))
+                taken.append(key)
+    return taken
+
+
+def _put(folder: Path, key: PartKey, data: bytes) -> None:
+    """Puts a part in its place, and takes away what is in the way."""
+    _clear(folder, part_file(key))
+    replace_file(folder / part_file(key), data, staging=folder / STAGING)
+
+
+def _record(dataset: Dataset, parts: Sequence[Published], *, accepted: Sequence[PartKey]) -> None:
     """Writes new lines for parts that have other bytes than before, as made on another platform."""
-    platforms = list(dataset.manifest.platforms)
+    manifest = dataset.manifest
+    platforms = list(manifest.platforms)
     before = {entry.key: entry for entry in dataset.recorded_parts.entries()}
     now = {entry.key: entry for entry in numbered(parts, platforms)}
     if all(before[key] == entry for key, entry in now.items()):
         return
-    lines = before | now
-    table = PartTable.empty().with_entries(list(lines.values()))
-    write_tables(
-        dataset.folder, dataset.manifest, tasks=dataset.recorded_tasks, table=table, platforms=platforms
-    )
+    table = PartTable.empty().with_entries(list((before | now).values()))
+    if accepted:
+        first, *others = manifest.runs
+        replaced = [*(first.origin or {}).get("replaced", ()), *map(str, accepted)]
+        origin = (first.origin or {}) | {"replaced": list(dict.fromkeys(replaced))}
+        manifest = manifest.model_copy(
+            update={"runs": (first.model_copy(update={"origin": origin}), *others)}
+        )
+    write_tables(dataset.folder, manifest, tasks=dataset.recorded_tasks, table=table, platforms=platforms)
 
 
 def _clear(folder: Path, file: str) -> None:
@@ -216,26 +327,7 @@ def _clear(folder: Path, file: str) -> None:
         lock.unlink()
 
 
-def lasting_damage(run: Run | None, key: PartKey) -> str | None:
-    """Why a part cannot be made again from what the dataset holds; None if it can.
-
-    Args:
-        run: its run, None if the manifest has no such run.
-        key: of the part.
-    """
-    if run is None:
-        return f"the manifest has no run {key.run}, of which the part of {key} is"
-    if run.kind not in ("built", "extended") or run.recipe is None or run.seed is None:
-        return f"the part of {key} was not built here, run {run.name} is {run.kind}"
-    return None
-
-
-def made_file(target: Path, run: Run, key: PartKey) -> Path:
-    """The file of a part that was made again in the folder `target`."""
-    return target / part_file(PartKey(key.task, key.step) if run.kind == "built" else key)
-
-
-def build_again(
+def _build_again(
     dataset: Dataset,
     run: Run,
     keys: Sequence[PartKey],
@@ -249,7 +341,7 @@ def build_again(
         dataset: that holds the damaged parts.
         run: a built run.
         keys: of the run's damaged parts.
-        target: folder for the new parts; `made_file` says where.
+        target: folder for the new parts.
         workers: units run at the same time.
         progress: called with the events of the build.
 
@@ -284,19 +376,23 @@ def build_again(
     return report.failed
 
 
-def extend_again(
+def _derive_again(
     dataset: Dataset, run: Run, keys: Sequence[PartKey], target: Path, workers: int | None
 ) -> tuple[str, ...]:
-    """Makes parts of an extended run from the stored policies; arguments and result as of `build_again`."""
+    """Makes parts of a derived run from other parts; arguments and result as of `_build_again`."""
     assert run.recipe is not None
-    assert run.seed is not None
-    origin = run.origin or {}
-    settings = {name: origin.get(name) for name in ("first_episode", "noise")}
-    of = origin.get("of", MAIN_RUN)
-    jobs = tuple(Job(PartKey(run.source_of(key.task), key.step, of), key) for key in keys)
+    operation = operation_of_run(run)
+    jobs = tuple(Job(_source_of(run, key), key) for key in keys)
+    source = next(found for found in dataset.manifest.runs if found.name == jobs[0].source.run)
     make_folders(target / STAGING)
     spec = DeriveSpec(
-        dataset.folder.resolve(), target.resolve(), EXTEND, settings, run.recipe, run.seed, jobs
+        dataset.folder.resolve(),
+        target.resolve(),
+        operation.name,
+        operation.settings_of(run, source),
+        run.recipe,
+        run.seed,
+        jobs,
     )
     try:
         derive_parts(spec, workers=workers)

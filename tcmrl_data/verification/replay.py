@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +45,8 @@ RETURN_ERRORS = 4.0
 episode must agree to 1e-3 (absolute, or relative to the larger value), and the mean return must lie within 4
 standard errors of the difference of two such means."""
 
+Item = TypeVar("Item")
+
 
 @dataclass(frozen=True)
 class Replay:
@@ -68,8 +70,8 @@ class Replay:
         return not self.platform_differences
 
 
-def spread_parts(keys: Sequence[PartKey], number: int) -> list[PartKey]:
-    """At most `number` parts, evenly spread over all, the first and the last among them."""
+def spread_parts(keys: Sequence[Item], number: int) -> list[Item]:
+    """At most `number` of some parts, evenly spread over all, the first and the last among them."""
     positions = np.linspace(0, len(keys) - 1, min(number, len(keys))).round().astype(int)
     return [keys[position] for position in positions]
 
@@ -125,7 +127,12 @@ def replay_part(
 
 
 def derived_problems(
-    folder: Path, table: PartTable, runs: Mapping[str, Run], *, bad: Collection[str]
+    folder: Path,
+    table: PartTable,
+    runs: Mapping[str, Run],
+    *,
+    bad: Collection[str],
+    only: Collection[str],
 ) -> Iterator[tuple[str, str]]:
     """Makes the parts that were made from others again, and yields files and how they differ: forged ones do.
 
@@ -136,6 +143,7 @@ def derived_problems(
         table: its parts.
         runs: its runs by name.
         bad: files of parts that are known not to hold.
+        only: files of the parts that are made again.
     """
     chosen = {name for name, run in runs.items() if run.kind != "built" and can_be_made_again(run)}
     if not chosen:
@@ -144,7 +152,7 @@ def derived_problems(
     files = files_of_parts(folder, table, bad=bad)
     for entry in table.entries():
         file, recipe = part_file(entry.key), runs[entry.run].recipe if entry.run in chosen else None
-        if recipe is None or file in bad:
+        if recipe is None or file in bad or file not in only:
             continue
         with contextlib.ExitStack() as stack:
             archive = stack.enter_context(Archive(folder / file))

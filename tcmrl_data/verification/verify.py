@@ -44,6 +44,11 @@ from tcmrl_data.verification.replay import (
     spread_parts,
 )
 
+FOREIGN = "belongs to no part"
+
+LEFT_EVERYWHERE = {"Thumbs.db", "desktop.ini"}
+"""Files that a system leaves in any folder, beside those whose names begin with a dot."""
+
 
 @dataclass(frozen=True)
 class VerifyReport:
@@ -54,6 +59,7 @@ class VerifyReport:
         files: number of files found, without work files.
         bytes: their total size.
         findings: everything that is wrong, ordered by file.
+        notes: files of others beside the data; findings with `strict`.
     """
 
     dataset: Path
@@ -64,6 +70,7 @@ class VerifyReport:
     replays: tuple[Replay, ...]
     findings: tuple[Finding, ...]
     seconds: float
+    notes: tuple[Finding, ...] = ()
 
 
 def verify_dataset(
@@ -71,6 +78,8 @@ def verify_dataset(
     *,
     level: VerifyLevel = "digests",
     replay: int = 0,
+    sample: int | None = None,
+    strict: bool = False,
     sources: Sequence[str | Path | Dataset] = (),
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> VerifyReport:
@@ -80,6 +89,9 @@ def verify_dataset(
         path: the dataset's folder or its `manifest.json`.
         level: the checks to make, see the module.
         replay: number of parts to make again from their snapshots and seeds, spread over the dataset.
+        sample: number of parts, spread over the dataset, of which more than name and size is checked; all
+            where None.
+        strict: files of others beside the data are findings.
         sources: datasets that a derived dataset was made of; its derivation is done again and compared.
         progress: called with parts done and parts in all.
 
@@ -98,13 +110,16 @@ def verify_dataset(
     folder = dataset_folder(path)
     if not folder.is_dir() or not any((folder / name).exists() for name in (MANIFEST, PARTS)):
         raise ManifestError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
-    run = _Verification(folder, level, is_locked=False)
+    run = _Verification(folder, level, is_locked=False, sample=sample)
     parts = run.check(progress)
     replays = run.replay(replay)
     run.derive_again(sources)
     sizes = [status.st_size for status in run.scan.files.values()]
     seconds = time.monotonic() - started
-    return VerifyReport(folder, level, parts, len(sizes), sum(sizes), replays, run.sorted_findings(), seconds)
+    found = run.sorted_findings()
+    notes = () if strict else tuple(finding for finding in found if finding.note)
+    found = tuple(finding for finding in found if strict or not finding.note)
+    return VerifyReport(folder, level, parts, len(sizes), sum(sizes), replays, found, seconds, notes)
 
 
 def find_problems(folder: Path, level: VerifyLevel) -> tuple[Finding, ...]:
@@ -121,10 +136,14 @@ class _Verification:
         folder: the dataset.
         level: the checks to make.
         is_locked: this process holds the dataset's lock.
+        sample: number of parts that are opened; all where None.
     """
 
-    def __init__(self, folder: Path, level: VerifyLevel, *, is_locked: bool) -> None:
+    def __init__(
+        self, folder: Path, level: VerifyLevel, *, is_locked: bool, sample: int | None = None
+    ) -> None:
         self._folder, self._level, self._is_locked = folder, level, is_locked
+        self._sample = sample
         began_beside_a_build = self._has_writer()
         self._description = Description.of(folder)
         self.findings = [*self._description.findings]
@@ -149,9 +168,10 @@ class _Verification:
             for file in unnamed:
                 self._add(file, _unnamed(file, manifest), foreign=True)
         checks = PartChecks(self._folder, self._level, self._description)
+        opened = set(spread_parts([*entries], len(entries) if self._sample is None else self._sample))
 
         def check(file: str, entry: PartEntry | None) -> list[str]:
-            return list(checks.problems(file, self.scan.files.get(file), entry))
+            return list(checks.problems(file, self.scan.files.get(file), entry, opened=file in opened))
 
         with ThreadPoolExecutor(available_cores()) as pool:
             checked = zip(entries, pool.map(check, entries, entries.values()), strict=True)
@@ -166,7 +186,7 @@ class _Verification:
         if self._level == "deep" and manifest is not None:
             bad = {found.file for found in self.findings}
             table, runs = self._description.table, {run.name: run for run in manifest.runs}
-            for file, problem in derived_problems(self._folder, table, runs, bad=bad):
+            for file, problem in derived_problems(self._folder, table, runs, bad=bad, only=opened):
                 self._add(file, problem)
         of_copy = copy_problem(self._folder)
         if of_copy and not self._is_written:
@@ -219,7 +239,7 @@ class _Verification:
         for file, status in self.scan.files.items():
             problem = file_problem(status)
             if file not in expected:
-                self._add(file, problem or "belongs to no part", foreign=True)
+                self._add(file, problem or FOREIGN, foreign=True, note=problem is None and _is_harmless(file))
             elif problem and key_of_file(file) is None:
                 self._add(file, problem)
         for name, seal in self._description.seals.items():
@@ -231,12 +251,20 @@ class _Verification:
         used = {str(parent) for folder in folders for parent in (folder, *folder.parents)}
         for place in self.scan.empty_folders - used:
             if not self._is_written:
-                self._add(place, "is a folder that no part has", foreign=True)
+                self._add(place, "is a folder that no part has", foreign=True, note=True)
+        for place in self.scan.hidden:
+            self._add(place, FOREIGN, foreign=True, note=True)
         for place, problem in self.scan.problems.items():
             self._add(place, problem, foreign=place not in used)
 
-    def _add(self, file: str, problem: str, *, foreign: bool = False) -> None:
-        self.findings.append(finding(file, problem, foreign=foreign))
+    def _add(self, file: str, problem: str, *, foreign: bool = False, note: bool = False) -> None:
+        self.findings.append(finding(file, problem, foreign=foreign, note=note))
+
+
+def _is_harmless(file: str) -> bool:
+    """Whether a file of no part lies beside the data, or is one that systems leave everywhere."""
+    name = file.rpartition("/")[2]
+    return not file.startswith(f"{PARTS}/") or name.startswith(".") or name in LEFT_EVERYWHERE
 
 
 def _unnamed(file: str, manifest: Manifest) -> str:
