@@ -11,7 +11,7 @@ from tcmrl_data.building.work_files import WORK_FILES, WORK_FOLDERS
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, status_of, words_after
-from tcmrl_data.store.keys import PartKey, is_part_folder, key_of_file
+from tcmrl_data.store.keys import PARTS, PartKey, is_part_folder, key_of_file
 from tcmrl_data.store.manifest import MANIFEST, Manifest, TableSeal, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_parts
 from tcmrl_data.store.sealing import is_complete
@@ -19,6 +19,12 @@ from tcmrl_data.store.tables import read_sealed
 from tcmrl_data.store.task_table import TASKS, parse_tasks
 
 VerifyLevel = Literal["quick", "digests", "deep"]
+
+NO_PART = "belongs to no part"
+NO_PARTS_FOLDER = "is a folder that no part has"
+
+LEFT_EVERYWHERE = {"Thumbs.db", "desktop.ini"}
+"""Files that a system leaves in any folder, beside those whose names begin with a dot."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +38,6 @@ class Finding:
         step: snapshot step of that part.
         run: run of that part.
         foreign: it belongs to nothing that the manifest names; repair leaves it alone.
-        note: a file of somebody else beside the data, such as `.DS_Store`, which harms nothing.
     """
 
     file: str
@@ -41,19 +46,25 @@ class Finding:
     step: int | None = None
     run: str | None = None
     foreign: bool = False
-    note: bool = False
 
     @property
     def key(self) -> PartKey | None:
         """The part that a finding is about; None for other files, and for foreign ones."""
         return None if self.foreign else key_of_file(self.file)
 
+    @property
+    def note(self) -> bool:
+        """Whether it is a file or empty folder of others that lies beside the data or that systems leave."""
+        name = self.file.rpartition("/")[2]
+        is_beside = not self.file.startswith(f"{PARTS}/") or name.startswith(".") or name in LEFT_EVERYWHERE
+        return self.foreign and self.problem in (NO_PART, NO_PARTS_FOLDER) and is_beside
 
-def finding(file: str, problem: str, *, foreign: bool = False, note: bool = False) -> Finding:
+
+def finding(file: str, problem: str, *, foreign: bool = False) -> Finding:
     """A finding about a file, which may be a part's."""
     key = key_of_file(file)
     if key is None:
-        return Finding(file, problem, foreign=foreign, note=note)
+        return Finding(file, problem, foreign=foreign)
     return Finding(file, problem, key.task, key.step, key.run, foreign)
 
 

@@ -34,7 +34,15 @@ from tcmrl_data.store.part_record import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification.contents import PartChecks, task_problems
-from tcmrl_data.verification.description import Description, Finding, VerifyLevel, finding, scan_dataset
+from tcmrl_data.verification.description import (
+    NO_PART,
+    NO_PARTS_FOLDER,
+    Description,
+    Finding,
+    VerifyLevel,
+    finding,
+    scan_dataset,
+)
 from tcmrl_data.verification.replay import (
     Replay,
     derivation_problems,
@@ -43,11 +51,6 @@ from tcmrl_data.verification.replay import (
     replay_part,
     spread_parts,
 )
-
-FOREIGN = "belongs to no part"
-
-LEFT_EVERYWHERE = {"Thumbs.db", "desktop.ini"}
-"""Files that a system leaves in any folder, beside those whose names begin with a dot."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +242,7 @@ class _Verification:
         for file, status in self.scan.files.items():
             problem = file_problem(status)
             if file not in expected:
-                self._add(file, problem or FOREIGN, foreign=True, note=problem is None and _is_harmless(file))
+                self._add(file, problem or NO_PART, foreign=True)
             elif problem and key_of_file(file) is None:
                 self._add(file, problem)
         for name, seal in self._description.seals.items():
@@ -251,20 +254,14 @@ class _Verification:
         used = {str(parent) for folder in folders for parent in (folder, *folder.parents)}
         for place in self.scan.empty_folders - used:
             if not self._is_written:
-                self._add(place, "is a folder that no part has", foreign=True, note=True)
+                self._add(place, NO_PARTS_FOLDER, foreign=True)
         for place in self.scan.hidden:
-            self._add(place, FOREIGN, foreign=True, note=True)
+            self._add(place, NO_PART, foreign=True)
         for place, problem in self.scan.problems.items():
             self._add(place, problem, foreign=place not in used)
 
-    def _add(self, file: str, problem: str, *, foreign: bool = False, note: bool = False) -> None:
-        self.findings.append(finding(file, problem, foreign=foreign, note=note))
-
-
-def _is_harmless(file: str) -> bool:
-    """Whether a file of no part lies beside the data, or is one that systems leave everywhere."""
-    name = file.rpartition("/")[2]
-    return not file.startswith(f"{PARTS}/") or name.startswith(".") or name in LEFT_EVERYWHERE
+    def _add(self, file: str, problem: str, *, foreign: bool = False) -> None:
+        self.findings.append(finding(file, problem, foreign=foreign))
 
 
 def _unnamed(file: str, manifest: Manifest) -> str:
