@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tcmrl_data import Dataset, open_dataset
+from tcmrl_data import Dataset, merge_datasets, open_dataset, repair_dataset, verify_dataset
 from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.errors import BuildError, SelectionError
 from tcmrl_data.operations.apply import apply_operation
@@ -62,6 +62,7 @@ def test_a_part_is_made_again_from_its_record_and_its_source(
         key = PartKey(source.task.index, 150)
         files = {source.record.id: tiny.file_of(key)}
         replay = replay_part(archive, record, key, tiny.manifest.recipe, files)
+    assert replay is not None
     assert (replay.problems, replay.exact) == ((), True)
 
 
@@ -92,9 +93,28 @@ def test_an_operation_of_another_package_makes_a_dataset(tiny: Dataset, tmp_path
             "from": [tiny.entry(PartKey(key.task, key.step)).id],
             "settings": {"number": 1},
         }
+    report = verify_dataset(made.folder, level="deep", replay=2)
+    assert (report.findings, report.replays) == ((), ())  # what it was made from is not here
     again = apply_operation(tiny, tmp_path / "again", "last-episode", {"number": 1}, snapshots="last")
     assert again.manifest.root == made.manifest.root
     assert open_dataset(tmp_path / "last").manifest.derivation == again.manifest.derivation
+
+
+@pytest.mark.usefixtures("in_process")
+def test_parts_of_another_packages_operation_are_verified_and_repaired_by_it(
+    tiny: Dataset, tmp_path: Path
+) -> None:
+    """Beside the parts that they were made from."""
+    made = apply_operation(tiny, tmp_path / "noisy", "action-noise", {"sigma": 0.1}, snapshots="last")
+    merge_datasets([tiny, made], tmp_path / "both")
+    both = open_dataset(tmp_path / "both")
+    assert verify_dataset(both.folder, level="deep").findings == ()
+    (found,) = (entry for entry in both.parts.entries_of(tiny.train_tasks[0].index) if entry.run != "main")
+    good = both.file_of(found.key).read_bytes()
+    both.file_of(found.key).unlink()
+    report = repair_dataset(both.folder)
+    assert (report.repaired, report.failed, report.left) == ((found.key,), (), ())
+    assert both.file_of(found.key).read_bytes() == good
 
 
 @pytest.mark.parametrize(

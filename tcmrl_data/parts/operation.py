@@ -167,6 +167,10 @@ class Simulator:
             self._lanes = None
 
 
+class MissingSourceError(BuildError):
+    """A part cannot be made again, since the one that it was made from is not at hand."""
+
+
 @dataclass(frozen=True)
 class Sources:
     """What the episodes of a part may be made from, beside its identity.
@@ -190,10 +194,10 @@ class Sources:
         """The one part that another is made from.
 
         Raises:
-            BuildError: it is not among the sources.
+            MissingSourceError: it is not among the sources.
         """
         if not self.parts:
-            raise BuildError("the part that it was made from is not in this dataset")
+            raise MissingSourceError("the part that it was made from is not in this dataset")
         return self.parts[0]
 
 

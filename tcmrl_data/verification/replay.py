@@ -19,6 +19,7 @@ from tcmrl_data.operations.split import EPISODES, FOLD, plan_episodes, plan_fold
 from tcmrl_data.operations.subset import Choice, plan_subset
 from tcmrl_data.parts.making import operation_of
 from tcmrl_data.parts.operation import (
+    MissingSourceError,
     Operation,
     Simulator,
     Sources,
@@ -82,8 +83,8 @@ def replay_part(
     key: PartKey,
     recipe: Recipe,
     files: Mapping[str, Path] | None = None,
-) -> Replay:
-    """Makes a part again by its operation and compares.
+) -> Replay | None:
+    """Makes a part again by its operation and compares; None if a part that it was made from is not at hand.
 
     Args:
         archive: the part.
@@ -121,6 +122,8 @@ def replay_part(
             made = pack(operation.make(wanted, Sources(simulator, sources)))
         compare = _drift_problems if differences else _bit_problems
         problems = tuple(compare(read_arrays(archive, identity.arrays), made))
+    except MissingSourceError:
+        return None
     except (TcmrlError, ValidationError, KeyError, IndexError, ValueError, TypeError, RuntimeError) as error:
         problems = (f"cannot be made again ({' '.join(str(error).split())[:200]})",)
     return Replay(key.task, key.step, key.run, differences, problems)
@@ -158,7 +161,7 @@ def derived_problems(
             archive = stack.enter_context(Archive(folder / file))
             record = read_part_record(archive)
             replay = replay_part(archive, record, entry.key, recipe, files)
-            for problem in replay.problems if replay.exact else ():
+            for problem in replay.problems if replay is not None and replay.exact else ():
                 yield file, f"made again: {problem}"
             for part_id, source in _open_sources(stack, record, files).items():
                 for what in _contradictions(record, source.record):

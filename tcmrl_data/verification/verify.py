@@ -214,9 +214,10 @@ class _Verification:
             except (StoreError, ManifestError) as error:  # the quick level has not opened it
                 self._add(part_file(key), words_after(error, file))
                 continue
-            replays.append(replay)
-            for problem in replay.problems:
-                self._add(part_file(key), f"replay: {problem}")
+            if replay is not None:
+                replays.append(replay)
+                for problem in replay.problems:
+                    self._add(part_file(key), f"replay: {problem}")
         return tuple(replays)
 
     def derive_again(self, sources: Sequence[str | Path | Dataset]) -> None:
