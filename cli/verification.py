@@ -187,15 +187,13 @@ def repair(
         click.echo(
             f"{printable(str(report.dataset))}: {len(report.repaired) + len(report.accepted):,} parts "
             f"regenerated, {f'{len(report.copied):,} copied, ' if report.copied else ''}"
-            f"{len(report.tables):,} tables rewritten, {_count(report.left)} not repaired"
+            f"{len(report.tables):,} tables rewritten, {len(report.left):,} findings left"
             f"{'; the folder cannot be written, and no write was needed' if report.read_only else ''}"
         )
+        if report.accepted:
+            click.echo(f"the root is now {report.root}; the manifest names the new parts")
     if report.failed:
         fail_incomplete(f"{report.failed[0]}; run the same command again to continue")
-    if report.accepted:
-        click.echo(
-            f"{printable(str(report.dataset))}: root {report.root} now; the manifest names the new parts"
-        )
     left = [finding for finding in report.left if not finding.note]
     if left:
         fail_incomplete(f"{report.dataset}: {_count(left)} that `repair` cannot resolve")

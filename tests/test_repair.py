@@ -11,6 +11,7 @@ from pathlib import Path
 from types import FrameType
 
 import pytest
+from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import derive_dataset, open_dataset, repair_dataset, verify_dataset
@@ -30,6 +31,7 @@ from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.tables import seal_of
 from tcmrl_data.store.task_table import TASKS
 from tcmrl_data.verification import repair
+from tests.commands import in_process
 from tests.damage import data_files, found, ids_of, rot
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
@@ -241,6 +243,19 @@ def test_parts_that_come_out_otherwise_are_taken_and_the_manifest_says_so(
     tasks = [task.index for task in open_dataset(folder).tasks]
     assert tcmrl_data.build_dataset(tiny_recipe, folder, tasks=tasks).built == 0
     assert read_manifest(folder).runs[0].origin == {"replaced": [str(key)]}
+
+
+@pytest.mark.usefixtures("another_processor")
+def test_the_command_offers_a_copy_and_takes_it(
+    tiny_copy: Copy, tiny_folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder, run = tiny_copy(), in_process(data, capsys)
+    (folder / part_file(PartKey(3, 0))).unlink()
+    code, _, error = run("repair", folder, "--quiet")
+    assert code != 0 and "--from COPY" in error and "--accept" in error
+    code, printed, _ = run("repair", folder, "--from", tiny_folder, "--quiet")
+    assert code == 0 and f"taken from {tiny_folder}, same digest" in printed
+    assert "0 parts regenerated, 1 copied, 0 tables rewritten, 0 findings left" in printed
 
 
 def refuse_to_build(*arguments: object, **options: object) -> None:
