@@ -1,8 +1,8 @@
 """Reading: `open_dataset` → `Dataset`; tables and parts are read when they are first used."""
 
-import functools
+import contextlib
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +78,7 @@ class Dataset(Tables):
         self, folder: Path, manifest: Manifest, file: Path | None = None, view: View | None = None
     ) -> None:
         super().__init__(folder, manifest, file, view)
-        self._record = functools.lru_cache(KEPT_RECORDS)(self._read_record)
+        self._records: dict[PartKey, PartRecord] = {}
 
     def __reduce__(self) -> tuple[type["Dataset"], tuple[Path, Manifest, Path, View | None]]:
         """Another process gets manifest and view, and reads tables and parts by itself."""
@@ -128,7 +128,12 @@ class Dataset(Tables):
             StoreError: the archive does not hold exactly the files that its record calls for.
             ManifestError: its record is not that of the part that the table names.
         """
-        return self._record(PartKey(task, step, run))
+        key = PartKey(task, step, run)
+        record = self._records.get(key)
+        if record is None:
+            with self._checked_part(key) as (_, record):
+                pass
+        return record
 
     def arrays(
         self, task: int, step: int, run: str = MAIN_RUN, *, names: Iterable[str] | None = None
@@ -141,8 +146,7 @@ class Dataset(Tables):
             run: name of the run.
             names: of the arrays; all where None.
         """
-        record = self.part(task, step, run)
-        with self.open_part(PartKey(task, step, run)) as archive:
+        with self._checked_part(PartKey(task, step, run)) as (archive, record):
             return read_arrays(archive, record.identity.arrays if names is None else names)
 
     def trajectories(self, task: int, step: int, run: str = MAIN_RUN) -> list[Trajectory]:
@@ -164,11 +168,13 @@ class Dataset(Tables):
         Raises:
             SnapshotError: the part has none, or it cannot be read.
         """
-        if self.part(task, step, run).identity.policy is None:
-            place = self.file_of(PartKey(task, step, run))
-            raise SnapshotError(f"{place}: holds no policy, since its source does not say which one acted")
-        with self.open_part(PartKey(task, step, run)) as archive:
-            return read_snapshot(archive.read, step, place=str(archive.path))
+        with self._checked_part(PartKey(task, step, run)) as (archive, record):
+            place = str(archive.path)
+            if record.identity.policy is None:
+                raise SnapshotError(
+                    f"{place}: holds no policy, since its source does not say which one acted"
+                )
+            return read_snapshot(archive.read, step, place=place)
 
     def select(
         self,
@@ -207,12 +213,19 @@ class Dataset(Tables):
         parts = {task.index: chosen_parts(self, task.index, rule) for task in chosen}
         return Selection(self, tuple(chosen), parts, allow_test, rule)
 
-    def _read_record(self, key: PartKey) -> PartRecord:
+    @contextlib.contextmanager
+    def _checked_part(self, key: PartKey) -> Iterator[tuple[Archive, PartRecord]]:
+        """The opened archive of a part and its record, which is read and checked once."""
         with self.open_part(key) as archive:
-            record = read_part_record(archive)
-            if record.id != self.entry(key).id or (record.identity.task, record.identity.step) != key[:2]:
-                raise ManifestError(
-                    f"{archive.path}: is not the part that the manifest names; run `tcmrl-data repair`"
-                )
-            check_members(archive, record)
-        return record
+            record = self._records.get(key)
+            if record is None:
+                record = read_part_record(archive)
+                if record.id != self.entry(key).id or (record.identity.task, record.identity.step) != key[:2]:
+                    raise ManifestError(
+                        f"{archive.path}: is not the part that the manifest names; run `tcmrl-data repair`"
+                    )
+                check_members(archive, record)
+                if len(self._records) >= KEPT_RECORDS:
+                    self._records.clear()  # one operation, beside other threads that read
+                self._records[key] = record
+            yield archive, record

@@ -258,8 +258,7 @@ def read_published(file: Path, run: str) -> tuple[Published, PartRecord]:
     with Archive(file) as archive:
         record = read_part_record(archive)
         check_members(archive, record)
-        for name in archive.names:
-            archive.read(name)  # compares its checksum
+        archive.check_form()
         return Published.of_record(record, run=run, archive=archive.content()), record
 
 

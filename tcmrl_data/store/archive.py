@@ -1,18 +1,19 @@
-"""One file with many members: a stored ZIP of exactly one form, written and read by this module alone.
+"""One file with many members: a stored ZIP, written and read through the standard library's `zipfile`.
 
-Any ZIP reader opens it. This one accepts nothing but what `pack_archive` writes: members behind one another
-from the first byte on, then the directory, then the end record. The reader rebuilds every header from name,
-size and checksum and compares, so that no byte of the file is without a meaning.
+Any ZIP reader opens it. What is written is a function of names and contents alone. Reading takes any stored
+ZIP; `Archive.check_form` also refuses bytes that `pack_archive` does not write, where no digest tells them.
 """
 
 import hashlib
+import io
 import re
 import struct
+import zipfile
 from collections.abc import Mapping
 from os import fstat, pread
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Self
+from typing import Self
 from zlib import crc32
 
 from tcmrl_data.foundation.errors import StoreError, UnreadableError
@@ -26,29 +27,12 @@ LONGEST_NAME = 128
 
 REPAIR = "; run `tcmrl-data repair`"
 
-_LOCAL = struct.Struct("<4s5H3L2H")
-_CENTRAL = struct.Struct("<4s6H3L5H2L")
-_END = struct.Struct("<4s4H2LH")
-_VERSION = 20
-_MADE_BY = 3 << 8 | _VERSION  # Unix
-_DATE = 1 << 5 | 1  # 1980-01-01, at midnight
-_MODE = 0o100644 << 16  # a regular file
-_NAME = re.compile(rb"[a-z0-9_][a-z0-9_.]*(?:/[a-z0-9_][a-z0-9_.]*)*")
+_LOCAL, _CENTRAL, _END = 30, 46, 22
+"""Bytes of a member's header and of its entry in the directory, but for its name, and of the end record."""
 
-_TAIL_BYTES = 2**14
-"""Read first: end record and directory of up to about 200 members."""
-
+_NAME = re.compile(r"[a-z0-9_][a-z0-9_.]*(?:/[a-z0-9_][a-z0-9_.]*)*")
 _HASHED_BYTES = 2**22
 """Read at once to be hashed."""
-
-
-class _Member(NamedTuple):
-    """A member's header, the header's offset, and the length of the content behind it."""
-
-    header: bytes
-    offset: int
-    size: int
-    checksum: int
 
 
 def pack_archive(files: Mapping[str, bytes]) -> bytes:
@@ -63,33 +47,26 @@ def pack_archive(files: Mapping[str, bytes]) -> bytes:
     """
     if len(files) > MOST_MEMBERS:
         raise StoreError(f"an archive has at most {MOST_MEMBERS} members, got {len(files)}")
-    headers = _LOCAL.size + _CENTRAL.size
-    size = _END.size + sum(headers + 2 * len(name) + len(content) for name, content in files.items())
+    size = _END + sum(_LOCAL + _CENTRAL + 2 * len(name) + len(content) for name, content in files.items())
     if size > LARGEST_ARCHIVE:
         raise StoreError(f"an archive has at most {LARGEST_ARCHIVE} bytes, got {size}; make smaller parts")
-    members: list[bytes] = []
-    directory: list[bytes] = []
-    offset = 0
-    for name, content in files.items():
-        encoded = name.encode("ascii", "replace")
-        if not _allowed(encoded):
-            raise StoreError(
-                f"a member's name is a relative path of a-z, 0-9, _ and . with at most {LONGEST_NAME} "
-                f"characters, got {printable(name)[:200]!r}; rename it"
-            )
-        checksum = crc32(content)
-        header = _local_header(encoded, len(content), checksum)
-        members += (header, content)
-        directory.append(_central_header(encoded, len(content), checksum, offset))
-        offset += len(header) + len(content)
-    end = _end_record(len(directory), sum(map(len, directory)), offset)
-    return b"".join((*members, *directory, end))
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        for name, content in files.items():
+            if not _allowed(name):
+                raise StoreError(
+                    f"a member's name is a relative path of a-z, 0-9, _ and . with at most {LONGEST_NAME} "
+                    f"characters, got {printable(name)[:200]!r}; rename it"
+                )
+            member = zipfile.ZipInfo(name)  # of 1980-01-01
+            member.create_system = 3  # Unix, on every system
+            member.external_attr = 0o100644 << 16  # a regular file
+            archive.writestr(member, content)
+    return buffer.getvalue()
 
 
 class Archive:
-    """An opened archive, whose directory was checked; contents are checked as they are read.
-
-    Threads may read side by side.
+    """An opened archive; contents are checked as they are read. Threads may read side by side.
 
     Attributes:
         path: the file.
@@ -109,7 +86,7 @@ class Archive:
         """Opens an archive.
 
         Raises:
-            StoreError: the file is missing, no plain file, or not of the one form.
+            StoreError: the file is missing, no plain file, or no ZIP of members as they are written here.
         """
         self.path = path
         try:
@@ -126,7 +103,7 @@ class Archive:
         except BaseException:
             self.close()
             raise
-        self.sizes: Mapping[str, int] = {name: member.size for name, member in self._members.items()}
+        self.sizes: Mapping[str, int] = {name: member.file_size for name, member in self._members.items()}
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -150,7 +127,7 @@ class Archive:
         return f"{self.path}: {name}"
 
     def read(self, name: str, *, limit: int | None = None) -> bytes:
-        """The content of a member, read at once and checked against header and checksum.
+        """The content of a member, checked against its checksum.
 
         Args:
             name: the member.
@@ -160,7 +137,7 @@ class Archive:
             StoreError: no such member, larger than the limit, or damaged.
         """
         content = self.read_unchecked(name, limit=limit)
-        if crc32(content) != self._members[name].checksum:
+        if crc32(content) != self._members[name].CRC:
             raise StoreError(f"{self.place(name)} is damaged{REPAIR}")
         return content
 
@@ -172,15 +149,26 @@ class Archive:
         member = self._members.get(name)
         if member is None:
             raise StoreError(f"{self.place(name)} is missing{REPAIR}")
-        if limit is not None and member.size > limit:
+        size = member.file_size
+        if limit is not None and size > limit:
             raise StoreError(
-                f"{self.place(name)} has {member.size} bytes, more than the {limit} allowed here{REPAIR}"
+                f"{self.place(name)} has {size} bytes, more than the {limit} allowed here{REPAIR}"
             )
-        start = member.offset + len(member.header)
-        content = self._read_range(start, member.size)
-        if self._read_range(member.offset, len(member.header)) != member.header or len(content) < member.size:
+        start = _LOCAL + len(name)
+        data = self._read_range(member.header_offset, start + size)
+        header = (data[:4], data[26:_LOCAL], data[_LOCAL:start])
+        if header != (b"PK\3\4", struct.pack("<2H", len(name), 0), name.encode()) or len(data) < start + size:
             raise StoreError(f"{self.place(name)} is damaged{REPAIR}")
-        return content
+        return data[start:]
+
+    def check_form(self) -> None:
+        """Reads everything and compares it with what `pack_archive` writes.
+
+        Raises:
+            StoreError: a member is damaged, or a byte belongs to no member.
+        """
+        if pack_archive({name: self.read(name) for name in self.names}) != self.content():
+            raise StoreError(f"{self.path} is not written as archives are here{REPAIR}")
 
     def content(self) -> bytes:
         """The whole file.
@@ -201,56 +189,34 @@ class Archive:
             digest.update(self._read_range(offset, min(_HASHED_BYTES, self.size - offset)))
         return digest.hexdigest()
 
-    def _read_directory(self) -> dict[str, _Member]:
-        """All members by name, from the directory at the end of the file.
+    def _read_directory(self) -> dict[str, zipfile.ZipInfo]:
+        """All members by name.
 
         Raises:
-            StoreError: directory and end record are not exactly what `pack_archive` writes.
+            StoreError: there is no directory, or one of members that are not written here.
         """
-        tail = self._read_range(max(0, self.size - _TAIL_BYTES), min(self.size, _TAIL_BYTES))
-        end = tail[-_END.size :]
-        if len(end) < _END.size:
-            raise self._refusal("is too short for an archive")
-        count, length, start = _END.unpack(end)[4:7]
-        if end != _end_record(count, length, start):
-            raise self._refusal("does not end as an archive does")
-        if start + length + _END.size != self.size:
-            raise self._refusal("has bytes that belong to no member")
-        if count > MOST_MEMBERS or length > count * (_CENTRAL.size + LONGEST_NAME):
-            raise self._refusal(f"has a directory of {length} bytes for {count} members")
-        if length + _END.size <= len(tail):
-            directory = tail[len(tail) - _END.size - length : -_END.size]
-        else:
-            directory = self._read_range(start, length)
-        return self._parse(directory, count, start)
-
-    def _parse(self, directory: bytes, count: int, start: int) -> dict[str, _Member]:
-        """All members by name, if they fill the file up to the directory's start.
-
-        Raises:
-            StoreError: an entry is not what `pack_archive` writes for a member at this place.
-        """
-        members: dict[str, _Member] = {}
-        position = offset = 0
-        for number in range(1, count + 1):
-            if len(directory) < position + _CENTRAL.size:
-                raise self._refusal(f"has a directory that ends before entry {number} of {count}")
-            fields = _CENTRAL.unpack_from(directory, position)
-            checksum, size, name_length = fields[7], fields[9], fields[10]
-            name = directory[position + _CENTRAL.size : position + _CENTRAL.size + name_length]
-            expected = _central_header(name, size, checksum, offset)
-            if not _allowed(name) or not directory.startswith(expected, position):
-                raise self._refusal(f"has a directory whose entry {number} is of no allowed form")
-            member = _Member(_local_header(name, size, checksum), offset, size, checksum)
-            if members.setdefault(name.decode("ascii"), member) is not member:
-                raise self._refusal(f"has two members {name.decode('ascii')}")
-            position += len(expected)
-            offset += len(member.header) + size
-            if offset > start:
-                raise self._refusal(f"has no room for the content of {name.decode('ascii')}")
-        if position != len(directory) or offset != start:
-            raise self._refusal("has bytes that belong to no member")
-        return members
+        self._read_range(max(0, self.size - _END), _END)  # what the system refuses is no damage
+        try:
+            with zipfile.ZipFile(self._file) as archive:
+                members = archive.infolist()
+        except (zipfile.BadZipFile, NotImplementedError, ValueError, OverflowError, struct.error) as error:
+            raise StoreError(f"{self.path} is no archive ({one_line(error)}){REPAIR}") from None
+        if len(members) > MOST_MEMBERS:
+            raise StoreError(
+                f"{self.path} has {len(members)} members, at most {MOST_MEMBERS} are allowed{REPAIR}"
+            )
+        found: dict[str, zipfile.ZipInfo] = {}
+        for member in members:
+            if (
+                not _allowed(member.filename)
+                or member.filename in found
+                or (member.compress_type, member.flag_bits) != (zipfile.ZIP_STORED, 0)
+                or member.compress_size != member.file_size
+                or not 0 <= member.header_offset <= self.size - member.file_size
+            ):
+                raise StoreError(f"{self.path} has a member of no allowed form{REPAIR}")
+            found[member.filename] = member
+        return found
 
     def _read_range(self, offset: int, size: int) -> bytes:
         """Bytes of the file; fewer where it has become shorter."""
@@ -266,30 +232,6 @@ class Archive:
             raise UnreadableError(f"{self.path} cannot be read ({one_line(error)})") from None
         return data
 
-    def _refusal(self, problem: str) -> StoreError:
-        return StoreError(f"{self.path} {problem}{REPAIR}")
 
-
-def _allowed(name: bytes) -> bool:
+def _allowed(name: str) -> bool:
     return len(name) <= LONGEST_NAME and _NAME.fullmatch(name) is not None
-
-
-def _local_header(name: bytes, size: int, checksum: int) -> bytes:
-    """What stands before a member's content."""
-    return _LOCAL.pack(b"PK\3\4", _VERSION, 0, 0, 0, _DATE, checksum, size, size, len(name), 0) + name
-
-
-def _central_header(name: bytes, size: int, checksum: int, offset: int) -> bytes:
-    """A member's entry in the directory."""
-    return (
-        _CENTRAL.pack(
-            *(b"PK\1\2", _MADE_BY, _VERSION, 0, 0, 0, _DATE, checksum, size, size),
-            *(len(name), 0, 0, 0, 0, _MODE, offset),
-        )
-        + name
-    )
-
-
-def _end_record(count: int, length: int, start: int) -> bytes:
-    """The end of an archive: members, and where its directory lies."""
-    return _END.pack(b"PK\5\6", 0, 0, count, count, length, start, 0)

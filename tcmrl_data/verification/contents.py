@@ -83,12 +83,11 @@ class PartChecks:
             StoreError: its members are not those of its record.
             ManifestError: its record cannot be read.
         """
-        if entry is None:
-            for name in archive.names:
-                archive.read(name)
-        elif archive.sha256() != entry.sha256:
+        if entry is not None and archive.sha256() != entry.sha256:
             yield "content does not have the recorded sha256"
             return
+        if entry is None or self._level == "deep":
+            archive.check_form()
         record = read_part_record(archive)
         check_members(archive, record)
         if entry is not None:
