@@ -23,10 +23,10 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem, read_plain_file
 from tcmrl_data.foundation.records import Record, _with_tuples
 from tcmrl_data.sampling.rows import READERS, ROW_ARRAYS, Table, fill_rows
-from tcmrl_data.store.arrays import _decode_chunk
-from tcmrl_data.store.layout import ARRAYS, _ArrayMetadata, chunk_problem
-from tcmrl_data.store.layout import ArrayLayout as Layout
-from tcmrl_data.store.part_record import RECORD, SHA256, PartRecord
+from tcmrl_data.store.arrays import ARRAYS, _ArrayMetadata, _decode_chunk, chunk_problem
+from tcmrl_data.store.arrays import ArrayLayout as Layout
+from tcmrl_data.store.keys import SHA256
+from tcmrl_data.store.part import RECORD, PartRecord
 
 _FILE_NAME = re.compile(
     r"policy\.(json|safetensors)|zarr\.json|[a-z0-9_]{1,64}/(zarr\.json|c(/[0-9]{1,9}){1,2})"

@@ -19,7 +19,7 @@ from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.keys import PartKey, part_file, part_folder
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
-from tcmrl_data.store.part_record import PartRecord, References
+from tcmrl_data.store.part import PartRecord, References
 from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartEntry, PartTable, part_line
 from tcmrl_data.store.tables import TableWriter
 

@@ -26,11 +26,10 @@ from tcmrl_data.foundation.disk import write_file
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
-from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part_record import DATA_VERSION, References
+from tcmrl_data.store.manifest import Run, write_dataset
+from tcmrl_data.store.part import DATA_VERSION, References
 from tcmrl_data.store.part_table import PartTable, part_entry
 from tcmrl_data.store.platform import UNKNOWN
-from tcmrl_data.store.sealing import write_dataset
 
 STEPS = tuple(range(0, 1_000, 100))
 

@@ -12,7 +12,7 @@ from .measuring import MeasureOptions, plot_option, run_measure, stage_cells, ti
 
 if TYPE_CHECKING:
     from tcmrl_data import Coverage, Quality, Rewards
-    from tcmrl_data.dataset.tiers import Tier
+    from tcmrl_data.dataset.selection import Tier
     from tcmrl_data.quality.scores import StageQuality
 
 TIERS_SHOWN: tuple["Tier", ...] = ("random", "medium", "expert")

@@ -26,7 +26,7 @@ def show(dataset: Path, as_json: bool, quiet: bool) -> None:
       tcmrl-data show data/point-robot --json
     """
     import tcmrl_data
-    from tcmrl_data.dataset.summary import dataset_summary
+    from tcmrl_data.dataset.listing import dataset_summary
 
     opened = tcmrl_data.open_dataset(dataset)
     document = dataset_summary(opened)

@@ -16,9 +16,9 @@ from .dataset.diff import DiffLevel as DiffLevel
 from .dataset.diff import diff_datasets as diff_datasets
 from .dataset.listing import list_datasets as list_datasets
 from .dataset.returns import return_table as return_table
+from .dataset.selection import TIERS as TIERS
 from .dataset.selection import Selection as Selection
-from .dataset.tiers import TIERS as TIERS
-from .dataset.view import is_view_file as is_view_file
+from .dataset.view_file import is_view_file as is_view_file
 from .engine.base import ENGINES as ENGINES
 from .envs.base import ENVIRONMENTS as ENVIRONMENTS
 from .envs.base import Camera as Camera
@@ -106,7 +106,7 @@ from .sampling.rows import Moments as Moments
 from .sampling.sampler import Prefetch as Prefetch
 from .sampling.sampler import Sampler as Sampler
 from .sampling.sampler import open_sampler as open_sampler
-from .store.limits import MAX_TASKS as MAX_TASKS
+from .store.keys import MAX_TASKS as MAX_TASKS
 from .store.manifest import Manifest as Manifest
 from .verification.cleaning import Deletion as Deletion
 from .verification.cleaning import Garbage as Garbage

@@ -37,9 +37,9 @@ from tcmrl_data.store import archive as archive_module
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
-from tcmrl_data.store.part_record import PART_SCHEMA, RECORD
+from tcmrl_data.store.part import PART_SCHEMA, RECORD
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.task_table import TASKS as TASKS_TABLE
+from tcmrl_data.store.tables import TASKS as TASKS_TABLE
 from tests.conftest import TASKS, TINY
 
 pytestmark = pytest.mark.usefixtures("module_in_process")

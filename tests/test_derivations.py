@@ -11,8 +11,8 @@ from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.store.manifest import write_dataset
 from tcmrl_data.store.part_table import PartTable, part_entry
-from tcmrl_data.store.sealing import write_dataset
 from tests.commands import in_process
 from tests.graded import graded_dataset
 

@@ -17,7 +17,7 @@ from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreErr
 from tcmrl_data.foundation.records import count_ranges, read_ranges, sealed, write_ranges
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
-from tcmrl_data.store.part_record import References
+from tcmrl_data.store.part import References
 from tests.commands import assert_refused, in_process
 from tests.graded import graded_dataset
 

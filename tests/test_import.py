@@ -15,7 +15,7 @@ import tcmrl_algo
 import tcmrl_data
 from tcmrl_data import Dataset, TcmrlError, export_dataset, import_dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.errors import BuildError, SimulationError, SnapshotError, StoreError, TaskError
-from tcmrl_data.store.task_table import TASKS as TASK_TABLE
+from tcmrl_data.store.tables import TASKS as TASK_TABLE
 from tcmrl_data.verification.repair import repair_dataset
 from tests.conftest import TASKS
 from tests.test_interchange import assert_equal

@@ -16,11 +16,11 @@ from tcmrl_data.building import ledger
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError, ManifestError, TaskError
 from tcmrl_data.foundation.records import sealed
-from tcmrl_data.store import limits, manifest, tables
+from tcmrl_data.store import keys, manifest, tables
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.task_table import parse_tasks, task_line
+from tcmrl_data.store.tables import parse_tasks, task_line
 from tests.conftest import TINY
 from tests.simulated_disk import PreparedParts, at_last_part
 
@@ -264,7 +264,7 @@ def test_a_dataset_at_a_limit_is_built_and_read_and_one_beyond_is_refused_before
     }[limit]
 
     def allow(number: int) -> None:
-        for module in (limits, manifest):
+        for module in (keys, manifest):
             monkeypatch.setattr(module, limit, number, raising=False)
 
     allow(largest - 1)
@@ -297,9 +297,9 @@ def test_the_limits_of_tasks_and_of_parts_are_those_that_are_stated(tmp_path: Pa
 
 
 def test_the_longest_line_of_a_task_that_a_writer_may_write_is_read() -> None:
-    length = limits.LINE_BYTES - len(task_line(Task(7, "train", {"text": ""})))
+    length = keys.LINE_BYTES - len(task_line(Task(7, "train", {"text": ""})))
     task = Task(7, "train", {"text": "x" * length})
-    assert len(task_line(task)) == limits.LINE_BYTES
+    assert len(task_line(task)) == keys.LINE_BYTES
     assert parse_tasks(task_line(task), Path("tasks.jsonl")) == (task,)
 
 

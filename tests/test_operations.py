@@ -15,7 +15,7 @@ from tcmrl_data.parts.operation import OPERATIONS, Operation, Simulator, Sources
 from tcmrl_data.parts.stored import Import
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.part_record import read_part_record
+from tcmrl_data.store.part import read_part_record
 from tcmrl_data.verification.replay import replay_part
 
 KINDS = sorted({**OWN_OPERATIONS, **OPERATIONS.working()}.items())

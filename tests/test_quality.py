@@ -9,7 +9,7 @@ from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, measure_quality
 from tcmrl_data.quality.scores import bootstrap_interval, interquartile_mean, spread
-from tcmrl_data.store.part_record import References
+from tcmrl_data.store.part import References
 from tests.commands import Call, assert_refused, in_process
 from tests.graded import graded_dataset
 

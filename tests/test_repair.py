@@ -24,12 +24,12 @@ from tcmrl_data.foundation.errors import (
 )
 from tcmrl_data.foundation.records import sealed
 from tcmrl_data.parts import rollouts
-from tcmrl_data.store import platform, sealing
+from tcmrl_data.store import manifest as manifest_module
+from tcmrl_data.store import platform
 from tcmrl_data.store.keys import PARTS, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import seal_of
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.tables import TASKS, seal_of
 from tcmrl_data.verification import repair
 from tests.commands import in_process
 from tests.damage import data_files, found, ids_of, rot
@@ -160,8 +160,8 @@ def test_a_repair_killed_between_tables_and_manifest_is_finished_by_the_next(
 
     rot(folder / PARTS_TABLE)
     with monkeypatch.context() as patch:
-        patch.setattr(sealing, "replace_file", replace_some)
-        patch.setattr(sealing, "write_manifest", end)
+        patch.setattr(manifest_module, "replace_file", replace_some)
+        patch.setattr(manifest_module, "write_manifest", end)
         with pytest.raises(KeyboardInterrupt):
             repair_dataset(folder)
     assert replaced == [TASKS, PARTS_TABLE][:num_files]

@@ -12,7 +12,7 @@ from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.store.keys import PARTS
 from tcmrl_data.store.manifest import MANIFEST, restore_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.tables import TASKS
 from tcmrl_data.verification import making_again
 from tests.hostile.datasets import base, copies_of
 

@@ -18,7 +18,7 @@ from tcmrl_data import (
 )
 from tcmrl_data.foundation.disk import LOCK, lock_file
 from tcmrl_data.foundation.errors import LockedError, ManifestError, SelectionError, StoreError
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.tables import TASKS
 from tests.commands import assert_refused, in_process
 from tests.graded import graded_dataset
 

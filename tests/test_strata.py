@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, Task, load_recipe, open_dataset, split_dataset
-from tcmrl_data.dataset.shift import ParameterShift, parameter_shifts
+from tcmrl_data.dataset.returns import ParameterShift, parameter_shifts
 from tcmrl_data.envs.tasks import draw_from_strata, draw_tasks, in_order, middles_of_strata
 from tcmrl_data.foundation.errors import RecipeError
 from tcmrl_data.recipe.tasks import choose_tasks

@@ -31,7 +31,7 @@ from tcmrl_algo.tuning.space import Dimension, space_on
 from tcmrl_data import Dataset, SelectionError, TrainingError
 from tcmrl_data.engine.in_process import InProcessEngine
 from tcmrl_data.foundation.errors import CheckpointError, MissingPackageError
-from tcmrl_data.store.part_record import References
+from tcmrl_data.store.part import References
 from tests.commands import Call, assert_refused, in_process
 from tests.experiments import SMALL
 from tests.graded import graded_dataset

@@ -22,10 +22,9 @@ from tcmrl_data.foundation.errors import (
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PartKey, part_file, part_folder
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
-from tcmrl_data.store.part_record import read_part_record
+from tcmrl_data.store.part import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import read_lines
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.tables import TASKS, read_lines
 from tcmrl_data.verification import replay as replay_module
 from tests.commands import in_process
 from tests.damage import data_files, found, rot

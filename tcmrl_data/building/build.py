@@ -19,9 +19,9 @@ from tcmrl_data.foundation.machine import size
 from tcmrl_data.recipe.recipe import Recipe, full_settings
 from tcmrl_data.store.keys import PARTS
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
-from tcmrl_data.store.part_record import DATA_VERSION
+from tcmrl_data.store.part import DATA_VERSION
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.tables import TASKS
 
 SEEDS = 2**63
 """Seeds are stored as int64, in exports too."""

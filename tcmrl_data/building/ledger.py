@@ -21,10 +21,9 @@ from tcmrl_data.foundation.plain_files import file_problem, folder_problem, stat
 from tcmrl_data.parts.making import Published, read_published
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_file, part_folder
-from tcmrl_data.store.limits import MAX_PLATFORMS
-from tcmrl_data.store.manifest import MANIFEST, Run, read_manifest, write_manifest
-from tcmrl_data.store.part_record import DATA_VERSION
+from tcmrl_data.store.keys import MAIN_RUN, MAX_PLATFORMS, PartKey, key_of_file, part_file, part_folder
+from tcmrl_data.store.manifest import MANIFEST, Run, manifest_bytes, read_manifest, write_manifest
+from tcmrl_data.store.part import DATA_VERSION
 from tcmrl_data.store.part_table import (
     HEADER,
     PARTS_TABLE,
@@ -34,9 +33,7 @@ from tcmrl_data.store.part_table import (
     parse_parts,
     part_line,
 )
-from tcmrl_data.store.sealing import manifest_bytes
-from tcmrl_data.store.tables import TableWriter, read_log, read_sealed
-from tcmrl_data.store.task_table import TASKS, parse_tasks, task_line
+from tcmrl_data.store.tables import TASKS, TableWriter, parse_tasks, read_log, read_sealed, task_line
 
 SEAL_SECONDS = 1.0
 SEAL_SHARE = 0.05

@@ -10,9 +10,9 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import TaskError
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
-from tcmrl_data.store.limits import check_plan
+from tcmrl_data.store.keys import check_plan
 from tcmrl_data.store.platform import Platform, this_platform
-from tcmrl_data.store.task_table import task_line
+from tcmrl_data.store.tables import task_line
 
 PROCESS_BYTES = 400 * 2**20
 """A worker beside its data: torch, MuJoCo and Zarr take about 310 MB as measured; the rest is margin."""

@@ -24,7 +24,7 @@ from tcmrl_data.parts.rollouts import Rollout, measure_references
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
-from tcmrl_data.store.part_record import DATA_VERSION, PartRecord, References, read_part_record
+from tcmrl_data.store.part import DATA_VERSION, PartRecord, References, read_part_record
 
 
 @dataclass(frozen=True)

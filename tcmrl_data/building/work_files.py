@@ -15,7 +15,7 @@ from tcmrl_data.foundation.plain_files import file_problem
 from tcmrl_data.store.keys import PARTS
 from tcmrl_data.store.manifest import MANIFEST_COPY
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.tables import TASKS
 
 WORK_FOLDERS = {STAGING, CHECKPOINTS}
 ASSEMBLY = ".assembly.json"

@@ -9,9 +9,9 @@ import numpy as np
 from tcmrl_data.card.citing import citation_text
 from tcmrl_data.card.yaml_text import yaml_text
 from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.listing import dataset_summary
 from tcmrl_data.dataset.returns import return_table, summarize_returns
-from tcmrl_data.dataset.summary import dataset_summary
-from tcmrl_data.dataset.tiers import TIERS
+from tcmrl_data.dataset.selection import TIERS
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import StoreError, TcmrlError
 from tcmrl_data.foundation.machine import size

@@ -14,7 +14,7 @@ from tcmrl_data.foundation.records import Record
 from tcmrl_data.recipe.document import RECIPE_SCHEMA
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.manifest import MANIFEST_SCHEMA, Manifest
-from tcmrl_data.store.part_record import PART_SCHEMA, PartRecord
+from tcmrl_data.store.part import PART_SCHEMA, PartRecord
 
 SchemaKind = Literal["manifest", "part", "recipe", "events"]
 KINDS: tuple[SchemaKind, ...] = get_args(SchemaKind)

@@ -12,7 +12,7 @@ from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.interchange.formats.base import FORMATS, ExportProgress, Format, no_progress
 from tcmrl_data.interchange.formats.new_folder import new_folder, require_free
 from tcmrl_data.interchange.optional import require_packages
-from tcmrl_data.store.task_table import task_line
+from tcmrl_data.store.tables import task_line
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,10 @@ from tcmrl_data.operations.assembly import Assembly, derivation_of, open_assembl
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.recipe import Recipe, bound_recipe, check_licence, foreign_recipe
-from tcmrl_data.store.keys import MAIN_RUN, PartKey
-from tcmrl_data.store.limits import check_plan
+from tcmrl_data.store.keys import MAIN_RUN, PartKey, check_plan
 from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part_record import DATA_VERSION, PartRecord
-from tcmrl_data.store.task_table import parse_task_file, task_line
+from tcmrl_data.store.part import DATA_VERSION, PartRecord
+from tcmrl_data.store.tables import parse_task_file, task_line
 
 ImportProgress = Callable[[int, int], None]
 """Called with the number of parts published and of all parts."""

@@ -25,7 +25,7 @@ from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_folder
 from tcmrl_data.store.manifest import Manifest, Run
-from tcmrl_data.store.part_record import DATA_VERSION, STANDARD_ARRAYS, PartRecord
+from tcmrl_data.store.part import DATA_VERSION, STANDARD_ARRAYS, PartRecord
 
 
 @final

@@ -12,9 +12,8 @@ from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.records import hidden_text
 from tcmrl_data.interchange.readers.base import ReadPart
-from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.limits import MAX_ARRAYS, MAX_INDEX
-from tcmrl_data.store.part_record import STANDARD_ARRAYS
+from tcmrl_data.store.keys import MAX_ARRAYS, MAX_INDEX, PartKey
+from tcmrl_data.store.part import STANDARD_ARRAYS
 
 
 @dataclass

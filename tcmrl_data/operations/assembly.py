@@ -26,13 +26,21 @@ from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.foundation.records import sealed, write_ranges
 from tcmrl_data.parts.making import Published, numbered, publish
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
-from tcmrl_data.store.keys import PartKey, part_file
-from tcmrl_data.store.limits import MAX_PARTS, MAX_PLATFORMS, MAX_RUNS
-from tcmrl_data.store.manifest import Derivation, Manifest, Run, Source, read_manifest, write_manifest
-from tcmrl_data.store.part_record import PartRecord
+from tcmrl_data.store.keys import MAX_PARTS, MAX_PLATFORMS, MAX_RUNS, PartKey, part_file
+from tcmrl_data.store.manifest import (
+    Derivation,
+    Manifest,
+    Run,
+    Source,
+    is_complete,
+    read_manifest,
+    totals_of,
+    write_dataset,
+    write_manifest,
+)
+from tcmrl_data.store.part import PartRecord
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, PartTable, part_line
 from tcmrl_data.store.platform import Platform
-from tcmrl_data.store.sealing import is_complete, totals_of, write_dataset
 from tcmrl_data.store.tables import TableWriter, read_sealed
 
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.dataset.tiers import MEDIUM_SCORE, medium_scores
-from tcmrl_data.dataset.view import VIEW_SCHEMA, ViewedParts, is_view_file
+from tcmrl_data.dataset.selection import MEDIUM_SCORE, medium_scores
+from tcmrl_data.dataset.view_file import VIEW_SCHEMA, ViewedParts, is_view_file
 from tcmrl_data.envs.tasks import Split
 from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.disk import LOCK, lock_file, replace_file
@@ -23,9 +23,9 @@ from tcmrl_data.store.manifest import (
     Manifest,
     dataset_folder,
     read_manifest,
+    totals_of,
     write_manifest,
 )
-from tcmrl_data.store.sealing import totals_of
 
 TOLERANCE = 15.0
 """A medium snapshot whose score is further from 33 than this is hardly medium: 18 to 48 are near."""

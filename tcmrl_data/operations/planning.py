@@ -16,7 +16,7 @@ from tcmrl_data.parts.operation import Operation, StoredPart, can_be_made_again
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import Derivation, Manifest, Run
-from tcmrl_data.store.part_record import PartRecord
+from tcmrl_data.store.part import PartRecord
 from tcmrl_data.store.platform import this_platform
 
 Progress = Callable[[int, int], None]

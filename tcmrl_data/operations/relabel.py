@@ -22,8 +22,7 @@ from tcmrl_data.parts.making import wanted_from
 from tcmrl_data.parts.operation import Simulator, Sources, StoredPart
 from tcmrl_data.parts.playback import RELABEL, first_episode_of
 from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
-from tcmrl_data.store.keys import MAIN_RUN, PartKey
-from tcmrl_data.store.limits import MAX_RUNS
+from tcmrl_data.store.keys import MAIN_RUN, MAX_RUNS, PartKey
 from tcmrl_data.store.manifest import Run
 
 

@@ -24,8 +24,7 @@ from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
 from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part_files import check_members
-from tcmrl_data.store.part_record import (
+from tcmrl_data.store.part import (
     DATA_VERSION,
     PART_SCHEMA,
     RECORD,
@@ -34,6 +33,7 @@ from tcmrl_data.store.part_record import (
     PartRecord,
     References,
     Statistics,
+    check_members,
     read_part_record,
 )
 from tcmrl_data.store.part_table import PartEntry, part_entry

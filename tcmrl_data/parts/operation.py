@@ -28,7 +28,7 @@ from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import FOREIGN_KINDS, Run, RunKind
-from tcmrl_data.store.part_record import DATA_VERSION, PartRecord
+from tcmrl_data.store.part import DATA_VERSION, PartRecord
 from tcmrl_data.store.platform import Platform, this_platform
 
 OperationSettings = TypeVar("OperationSettings", bound=BaseModel)

@@ -15,7 +15,7 @@ from tcmrl_data.foundation.errors import SimulationError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.parts.operation import Operation, Sources, WantedPart
-from tcmrl_data.store.limits import MAX_INDEX
+from tcmrl_data.store.keys import MAX_INDEX
 from tcmrl_data.store.manifest import Run
 
 RELABEL = "relabel"

@@ -15,9 +15,9 @@ from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.parts.operation import Operation, Simulator, Sources, WantedPart, check_finite
-from tcmrl_data.store.limits import MAX_INDEX
+from tcmrl_data.store.keys import MAX_INDEX
 from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part_record import PartRecord, References
+from tcmrl_data.store.part import PartRecord, References
 
 EXTEND = "extend"
 MAX_NOISE = 10.0

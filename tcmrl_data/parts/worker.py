@@ -25,7 +25,7 @@ from tcmrl_data.parts.making import (
 from tcmrl_data.parts.operation import Operation, Simulator, StoredPart
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.part_record import References
+from tcmrl_data.store.part import References
 from tcmrl_data.store.part_table import REFERENCES
 
 WORKER = "tcmrl_data.parts.worker"

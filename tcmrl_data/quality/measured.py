@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.dataset.tables import Tables
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import SelectionError, StoreError
@@ -74,7 +73,7 @@ class MeasuredStage(Record):
 Row = TypeVar("Row", bound=MeasuredPart | PartKey)
 
 
-def heading(dataset: Tables) -> dict[str, Any]:
+def heading(dataset: Dataset) -> dict[str, Any]:
     """What a record of the dataset begins with."""
     manifest = dataset.manifest
     return {"label": manifest.label, "environment": manifest.name, "root": manifest.root}

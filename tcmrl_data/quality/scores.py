@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
+from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.picture import new_figure, save_figure
-from tcmrl_data.dataset.tables import Tables
-from tcmrl_data.dataset.tiers import TIERS, Tier, task_scores, tier_parts
+from tcmrl_data.dataset.selection import TIERS, Tier, task_scores, tier_parts
 from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.records import Record
@@ -91,7 +91,7 @@ class Quality(Measured):
     tasks: tuple[TaskQuality, ...]
 
 
-def measure_quality(dataset: Tables) -> Quality:
+def measure_quality(dataset: Dataset) -> Quality:
     """Trajectory quality (TQ) and tiers of every part of a dataset.
 
     TQ is the mean return of a part, where 0 is the return of uniform actions and 1 the best return that is
@@ -107,7 +107,7 @@ def measure_quality(dataset: Tables) -> Quality:
     return Quality(**heading(dataset), stages=tuple(_stage(*stage) for stage in rows), tasks=tasks)
 
 
-def trajectory_quality(dataset: Tables, task: int) -> dict[PartKey, float]:
+def trajectory_quality(dataset: Dataset, task: int) -> dict[PartKey, float]:
     """TQ of the parts of a task; empty where it has no reference returns, or none above uniform actions."""
     try:
         return {key: score / 100 for key, score in task_scores(dataset, task).items()}
@@ -115,7 +115,7 @@ def trajectory_quality(dataset: Tables, task: int) -> dict[PartKey, float]:
         return {}
 
 
-def _task_quality(dataset: Tables, task: Task) -> TaskQuality:
+def _task_quality(dataset: Dataset, task: Task) -> TaskQuality:
     qualities = trajectory_quality(dataset, task.index)
     takers = {tier: _tier_parts(dataset, task.index, tier) for tier in TIERS}
     snapshots = tuple(
@@ -132,7 +132,7 @@ def _task_quality(dataset: Tables, task: Task) -> TaskQuality:
     return TaskQuality(task=task.index, split=task.split, snapshots=snapshots)
 
 
-def _tier_parts(dataset: Tables, task: int, tier: Tier) -> set[PartKey]:
+def _tier_parts(dataset: Dataset, task: int, tier: Tier) -> set[PartKey]:
     try:
         return set(tier_parts(dataset, task, tier))
     except SelectionError:  # the task has no such snapshot, or no reference returns

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.listing import dataset_summary
 from tcmrl_data.dataset.returns import return_table, task_table
-from tcmrl_data.dataset.summary import dataset_summary
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.quality.coverage import Coverage, measure_coverage
@@ -18,7 +18,7 @@ from tcmrl_data.report.excerpts import Browsed, Paths, browse
 from tcmrl_data.report.measures import Actions, Episodes, Visits
 from tcmrl_data.report.plane import Plane, choose_plane
 from tcmrl_data.report.strips import Strips, film_strips
-from tcmrl_data.store.part_record import STANDARD_ARRAYS
+from tcmrl_data.store.part import STANDARD_ARRAYS
 
 SHOWN_TASKS = 100
 """Tasks with a map of visits, paths and a learning curve; of more tasks, evenly chosen ones."""

@@ -6,7 +6,7 @@ from statistics import fmean
 from typing import Any
 
 from tcmrl_data.dataset.returns import summarize_returns
-from tcmrl_data.dataset.tiers import TIERS
+from tcmrl_data.dataset.selection import TIERS
 from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.page.markup import Markup, details, element, table

@@ -1,27 +1,38 @@
 """`manifest.json`: what a dataset is, in a few kilobytes, sealed by its own digest.
 
-Tasks and parts stand in tables beside it (`tables.py`). The manifest seals them by length and sha256.
+Tasks and parts stand in tables beside it (`tables.py`). The manifest seals them by length and sha256, and a
+dataset exists when its manifest does.
 """
 
 import contextlib
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import FailFast, Field, field_validator, model_validator
 
-from tcmrl_data.envs.tasks import Split
+from tcmrl_data.envs.tasks import Split, Task
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file, words_after
-from tcmrl_data.foundation.records import Record, parse_record, read_ranges
+from tcmrl_data.foundation.records import Record, parse_record, read_ranges, sealed
 from tcmrl_data.recipe.about import AND, joined_licences
 from tcmrl_data.recipe.profile import Profile
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.store.keys import RUN_NAME
-from tcmrl_data.store.limits import MAX_COUNT, MAX_INDEX, MAX_PARTS, MAX_PLATFORMS, MAX_RUNS, MAX_TASKS
-from tcmrl_data.store.part_record import SHA256
+from tcmrl_data.store.keys import (
+    MAX_COUNT,
+    MAX_INDEX,
+    MAX_PARTS,
+    MAX_PLATFORMS,
+    MAX_RUNS,
+    MAX_TASKS,
+    RUN_NAME,
+    SHA256,
+)
+from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartTable, part_line
 from tcmrl_data.store.platform import Platform
+from tcmrl_data.store.tables import TASKS, TableSeal, seal_of, task_line
 
 MANIFEST_SCHEMA = 2
 """Raised when the meaning or the layout of a dataset's files changes."""
@@ -112,14 +123,6 @@ class Derivation(Record):
             for split, text in (self.splits or {}).items()
             for task in read_ranges(text, limit=MAX_TASKS)
         }
-
-
-class TableSeal(Record):
-    """The lines of a table that belong to the dataset; what follows in the file is the log of a build."""
-
-    lines: int = Field(ge=0)
-    bytes: int = Field(ge=0, lt=MAX_COUNT)
-    sha256: str = Field(pattern=SHA256)
 
 
 class Totals(Record):
@@ -333,4 +336,124 @@ def _refuse_older(values: Any, file: Path) -> None:
     raise ManifestError(
         f"{file}: schema_version 1 is of an earlier tcmrl, which this one does not read; build the dataset "
         f"again in a new folder: `{command}`"
+    )
+
+
+def totals_of(table: PartTable) -> Totals:
+    """The sums over the parts of a table."""
+    return Totals(
+        parts=len(table),
+        episodes=table.total("episodes"),
+        steps=table.total("steps"),
+        bytes=table.total("size"),
+    )
+
+
+def write_dataset(
+    folder: Path,
+    *,
+    name: str,
+    label: str | None,
+    data_version: int,
+    runs: Sequence[Run],
+    derivation: Derivation | None,
+    platforms: Sequence[Platform],
+    tasks: Sequence[Task],
+    dropped: Collection[int] = (),
+    table: PartTable,
+) -> Manifest:
+    """Writes the tables and then the manifest that seals them; the dataset exists from then on.
+
+    Args:
+        folder: the dataset, where the parts of the table are.
+        name: the environment's name.
+        label: the dataset's own name.
+        data_version: of the parts.
+        runs: how the parts were made; the first has a recipe.
+        derivation: how the dataset was derived from others.
+        platforms: of the parts; the table refers to them by position.
+        tasks: all tasks, dropped ones too.
+        dropped: indices of tasks that do not belong to the dataset.
+        table: all parts.
+
+    Raises:
+        StorageError: the operating system refuses an operation.
+    """
+    tables = {
+        TASKS: b"".join(task_line(task) for task in sorted(tasks, key=lambda task: task.index)),
+        PARTS_TABLE: HEADER + b"".join(map(part_line, table.entries())),
+    }
+    for file, lines in tables.items():
+        replace_file(folder / file, lines, staging=folder / STAGING)
+    data = manifest_bytes(
+        name=name,
+        label=label,
+        data_version=data_version,
+        runs=runs,
+        derivation=derivation,
+        platforms=platforms,
+        tasks=seal_of(tables[TASKS]),
+        parts=seal_of(tables[PARTS_TABLE]),
+        dropped=dropped,
+        kept=table.without_tasks(dropped),
+    )
+    write_manifest(folder, data)
+    return read_manifest(folder)
+
+
+def manifest_bytes(
+    *,
+    name: str,
+    label: str | None,
+    data_version: int,
+    runs: Sequence[Run],
+    derivation: Derivation | None,
+    platforms: Sequence[Platform],
+    tasks: TableSeal,
+    parts: TableSeal,
+    dropped: Collection[int],
+    kept: PartTable,
+) -> bytes:
+    """The file of a manifest.
+
+    Args:
+        name: the environment's name.
+        label: the dataset's own name.
+        data_version: of the parts.
+        runs: how the parts were made.
+        derivation: how the dataset was derived from others.
+        platforms: of the parts.
+        tasks: seal of the table of all tasks, dropped ones too.
+        parts: seal of the table of all parts.
+        dropped: indices of tasks that do not belong to the dataset.
+        kept: the parts of the other tasks.
+    """
+    fields = {
+        "schema_version": MANIFEST_SCHEMA,
+        "name": name,
+        "label": label,
+        "data_version": data_version,
+        "runs": [run.model_dump(mode="json") for run in runs],
+        "derivation": None if derivation is None else derivation.model_dump(mode="json"),
+        "platforms": [platform.model_dump(mode="json") for platform in platforms],
+        "tasks": tasks.model_dump(),
+        "parts": parts.model_dump(),
+        "dropped": sorted(dropped),
+        "totals": totals_of(kept).model_dump(),
+        "root": kept.root,
+        "complete": is_complete(kept, runs, num_tasks=tasks.lines - len(dropped)),
+    }
+    return sealed(fields)
+
+
+def is_complete(table: PartTable, runs: Sequence[Run], *, num_tasks: int) -> bool:
+    """Whether every task has the snapshots that the runs plan.
+
+    Args:
+        table: parts of the tasks that belong to the dataset.
+        runs: of the dataset.
+        num_tasks: number of those tasks.
+    """
+    return all(
+        table.num_parts(run.name) == len(run.steps) * num_tasks for run in runs if run.steps is not None
     )

@@ -18,18 +18,22 @@ from tcmrl_data.foundation.errors import ManifestError, SnapshotError, StoreErro
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem, words_after
 from tcmrl_data.foundation.records import first_problem
 from tcmrl_data.parts.making import statistics
-from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.recipe.recipe import Recipe, same_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import array_digests, read_arrays, unpack
-from tcmrl_data.store.limits import MAX_TASKS
-from tcmrl_data.store.part_files import POLICY, check_members, identity_problems
-from tcmrl_data.store.part_record import RECORD, STANDARD_ARRAYS, PartRecord, read_part_record
-from tcmrl_data.store.part_table import PartEntry
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.keys import MAX_TASKS
+from tcmrl_data.store.manifest import Run
+from tcmrl_data.store.part import POLICY, RECORD, STANDARD_ARRAYS, PartRecord, check_members, read_part_record
+from tcmrl_data.store.part_table import REFERENCES, STATISTICS, PartEntry
+from tcmrl_data.store.tables import TASKS
 from tcmrl_data.verification.description import Description, VerifyLevel
 from tcmrl_data.verification.replay import origin_problem
 
 MISSING = "is missing"
+
+
+DERIVED_KINDS = ("extended", "relabelled")
+"""Kinds of runs whose parts name the task that their policy or their episodes come from."""
 
 
 class PartChecks:
@@ -108,7 +112,7 @@ class PartChecks:
             return
         if record.platform != self._description.manifest.platforms[entry.platform]:
             yield "was made on another platform than the dataset says"
-        yield from identity_problems(
+        yield from _identity_problems(
             record,
             entry=entry,
             task=task,
@@ -284,3 +288,48 @@ def _flag_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[ContentPr
             yield "terminated", f"or truncated is set before the last step of episode {episode}"
         if stop > start and not ended[stop - 1]:
             yield "truncated", f"nor terminated is set at the end of episode {episode}"
+
+
+def _identity_problems(
+    record: PartRecord,
+    *,
+    entry: PartEntry,
+    task: Task,
+    run: Run,
+    settings: Mapping[str, Any] | None,
+    data_version: int,
+) -> Iterator[str]:
+    """How a part's record differs from what the dataset says of it.
+
+    Args:
+        record: the part's record.
+        entry: the part in the table.
+        task: its task.
+        run: its run.
+        settings: of the run's recipe; None where the run was not built.
+        data_version: of the dataset.
+    """
+    identity = record.identity
+    for name, found, wanted in (
+        ("id", record.id, entry.id),
+        ("identity.task", identity.task, entry.task),
+        ("identity.step", identity.step, entry.step),
+        ("identity.data_version", identity.data_version, data_version),
+        ("identity.parameters", identity.parameters, task.parameters),
+        ("identity.seed", identity.seed, identity.seed if run.seed is None else run.seed),
+    ):
+        if found != wanted:
+            yield f"{name} is not the manifest's"
+    if settings is not None and not same_settings(identity.settings, settings):
+        yield "identity.settings is not the manifest's"
+    made = (identity.derived or {}).get("settings")
+    if run.kind in DERIVED_KINDS and (
+        not isinstance(made, dict) or made.get("task") != run.source_of(task.index)
+    ):
+        yield "identity.derived.settings.task is not the manifest's"
+    for name in STATISTICS:
+        if getattr(record.statistics, name) != getattr(entry, name):
+            yield f"statistics.{name} is not that of parts.jsonl"
+    for name in REFERENCES:
+        if getattr(record.references, name) != getattr(entry, name):
+            yield f"references.{name} is not that of parts.jsonl"

@@ -12,11 +12,9 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, status_of, words_after
 from tcmrl_data.store.keys import PARTS, PartKey, is_part_folder, key_of_file
-from tcmrl_data.store.manifest import MANIFEST, Manifest, TableSeal, read_manifest
+from tcmrl_data.store.manifest import MANIFEST, Manifest, is_complete, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_parts
-from tcmrl_data.store.sealing import is_complete
-from tcmrl_data.store.tables import read_sealed
-from tcmrl_data.store.task_table import TASKS, parse_tasks
+from tcmrl_data.store.tables import TASKS, TableSeal, parse_tasks, read_sealed
 
 VerifyLevel = Literal["quick", "digests", "deep"]
 

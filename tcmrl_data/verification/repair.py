@@ -44,7 +44,7 @@ from tcmrl_data.store.manifest import (
 )
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.platform import Platform, this_platform
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.tables import TASKS
 from tcmrl_data.verification.description import Finding, VerifyLevel
 from tcmrl_data.verification.tables import restore_tables, write_tables
 from tcmrl_data.verification.verify import find_problems, verify_dataset

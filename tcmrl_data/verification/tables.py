@@ -12,12 +12,10 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.parts.making import Published, numbered, read_published
 from tcmrl_data.recipe.tasks import choose_tasks
 from tcmrl_data.store.keys import PartKey, key_of_file, part_file
-from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, Manifest
+from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, Manifest, write_dataset
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_entries, parse_parts
 from tcmrl_data.store.platform import Platform
-from tcmrl_data.store.sealing import write_dataset
-from tcmrl_data.store.tables import read_lines, read_sealed
-from tcmrl_data.store.task_table import TASKS, parse_tasks
+from tcmrl_data.store.tables import TASKS, parse_tasks, read_lines, read_sealed
 from tcmrl_data.verification.contents import recipe_environment
 from tcmrl_data.verification.description import scan_dataset
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tcmrl_data.building.work_files import DESCRIPTIONS
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.dataset.view import is_view_file
+from tcmrl_data.dataset.view_file import is_view_file
 from tcmrl_data.foundation.disk import LOCK, lock_holder
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
@@ -30,9 +30,9 @@ from tcmrl_data.store.manifest import (
     dataset_folder,
     read_manifest,
 )
-from tcmrl_data.store.part_record import read_part_record
+from tcmrl_data.store.part import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.tables import TASKS
 from tcmrl_data.verification.contents import PartChecks, task_problems
 from tcmrl_data.verification.description import (
     NO_PART,

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.store.part_table import HEADER, PARTS_TABLE
-from tcmrl_data.store.task_table import TASKS
+from tcmrl_data.store.tables import TASKS
 from tests.hostile.case import (
     ESCAPE,
     Case,

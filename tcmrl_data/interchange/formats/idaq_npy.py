@@ -23,7 +23,7 @@ from tcmrl_data.interchange.formats.describing import stored_episodes
 from tcmrl_data.interchange.formats.new_folder import REMEDY
 from tcmrl_data.interchange.formats.pickled_rows import pickled_rows
 from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.task_table import task_line
+from tcmrl_data.store.tables import task_line
 
 TASKS_FILE = "tasks.json"
 

@@ -27,9 +27,8 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.spaces import Box
 from gymnasium.utils import RecordConstructorArgs
 
-from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.dataset import Dataset, TaskReferences
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.dataset.tables import TaskReferences
 from tcmrl_data.envs.base import make_environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory

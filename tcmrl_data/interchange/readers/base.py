@@ -13,7 +13,7 @@ from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plugins import Registry
-from tcmrl_data.store.limits import MAX_INDEX
+from tcmrl_data.store.keys import MAX_INDEX
 
 Say = Callable[[str], None]
 """Takes what a user should know of a file, such as episodes that were cut."""

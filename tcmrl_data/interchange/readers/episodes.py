@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import StoreError, TrajectoryError
-from tcmrl_data.store.part_record import ARRAY_NAME, STANDARD_ARRAYS
+from tcmrl_data.store.part import ARRAY_NAME, STANDARD_ARRAYS
 
 Array = npt.NDArray[Any]
 

@@ -22,7 +22,7 @@ import numpy.typing as npt
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, printable
 from tcmrl_data.interchange.readers.source_files import decoded_limit, require_file
-from tcmrl_data.store.limits import MAX_INDEX
+from tcmrl_data.store.keys import MAX_INDEX
 
 MOST_MEMBERS = 2**20
 LARGEST_ATTRIBUTE = 2**20

@@ -1,4 +1,4 @@
-"""Views: small files that name parts of a dataset, which open as a dataset does.
+"""ViewFile files: they name parts of a dataset, and open as a dataset does.
 
 A view holds the path of its source relative to itself, the source's root, and the keys of its parts. It opens
 only on a source with that root.
@@ -14,10 +14,8 @@ from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.foundation.records import Record, count_ranges, parse_record, read_ranges
-from tcmrl_data.store.keys import RUN_NAME, PartKey
-from tcmrl_data.store.limits import MAX_STEPS, MAX_TASKS
+from tcmrl_data.store.keys import MAX_STEPS, MAX_TASKS, RUN_NAME, SHA256, PartKey
 from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, Totals
-from tcmrl_data.store.part_record import SHA256
 
 VIEW_SCHEMA = 1
 
@@ -45,7 +43,7 @@ class ViewedParts(Record):
             yield from (PartKey(task, step, self.run) for step in self.steps)
 
 
-class View(Record):
+class ViewFile(Record):
     """A view file.
 
     Attributes:
@@ -69,7 +67,7 @@ class View(Record):
     parts: tuple[ViewedParts, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
-    def _is_no_larger_than_a_dataset(self) -> "View":
+    def _is_no_larger_than_a_dataset(self) -> "ViewFile":
         if sum(map(len, self.parts)) != self.totals.parts:
             raise ValueError("totals.parts is not the number of its parts")
         return self
@@ -106,7 +104,7 @@ def is_view_file(path: str | Path) -> bool:
     return path.suffix == ".json" and path.name != MANIFEST and not path.is_dir()
 
 
-def read_view(file: Path) -> View:
+def read_view(file: Path) -> ViewFile:
     """Reads a view file.
 
     Raises:
@@ -121,4 +119,4 @@ def read_view(file: Path) -> View:
         ) from None
     except (OSError, ValueError) as error:
         raise ManifestError(f"{file}: not a view ({one_line(error)}); derive it again") from None
-    return parse_record(View, values, file, version=VIEW_SCHEMA, data=data)
+    return parse_record(ViewFile, values, file, version=VIEW_SCHEMA, data=data)

@@ -1,16 +1,19 @@
 """The record of a part, `part.json` in its archive: its identity, what it holds, and where it was made."""
 
 import re
+from collections.abc import Sequence
+from math import prod
 from typing import Any, Literal
 
 from pydantic import Field, field_validator
 
 from tcmrl_data.foundation.canonical import digest, parse_json
-from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.foundation.plain_files import one_line
 from tcmrl_data.foundation.records import Record, parse_record
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.limits import MAX_ARRAYS, MAX_COUNT, MAX_INDEX, PART_RECORD_BYTES
+from tcmrl_data.store.arrays import ARRAYS, ArrayLayout, check_expansion, check_layout
+from tcmrl_data.store.keys import MAX_ARRAYS, MAX_COUNT, MAX_INDEX, PART_RECORD_BYTES, SHA256
 from tcmrl_data.store.platform import Platform
 
 PART_SCHEMA = 2
@@ -20,7 +23,6 @@ DATA_VERSION = 3
 """Raised by hand when the code's data change for the same recipe and seed."""
 
 RECORD = "part.json"
-SHA256 = r"^[0-9a-f]{64}$"
 
 STANDARD_ARRAYS = {
     "observations": ("float32", 2),
@@ -168,3 +170,37 @@ def _num_arrays(values: Any) -> int:
     identity = values.get("identity") if isinstance(values, dict) else None
     arrays = identity.get("arrays") if isinstance(identity, dict) else None
     return len(arrays) if isinstance(arrays, dict) else 0
+
+
+POLICY = ("policy.json", "policy.safetensors")
+"""The snapshot; the second file is missing where the policy has no weights."""
+
+
+def check_members(archive: Archive, record: PartRecord) -> list[ArrayLayout]:
+    """Checks that an archive holds the files of its record's arrays and policy and no others.
+
+    Returns:
+        The layouts of the arrays.
+
+    Raises:
+        StoreError: names the file.
+    """
+    layouts = check_layout(
+        archive, {name: array.model_dump() for name, array in record.identity.arrays.items()}
+    )
+    odd = _odd_member(archive, layouts, has_policy=record.identity.policy is not None)
+    if odd:
+        raise StoreError(f"{archive.place(odd)} does not agree with the arrays; run `tcmrl-data repair`")
+    check_expansion(layouts, archive.size, archive.path)
+    return layouts
+
+
+def _odd_member(archive: Archive, layouts: Sequence[ArrayLayout], *, has_policy: bool) -> str | None:
+    """A file that the part's record calls for and its archive lacks, or the other way round."""
+    found = set(archive.names)
+    for layout in layouts:
+        if prod(layout.grid) > len(found):
+            return f"{ARRAYS}/{layout.name}/c"
+    needed = {f"{ARRAYS}/zarr.json", RECORD}.union(*(layout.files() for layout in layouts))
+    needed |= {POLICY[0]} if has_policy else set()
+    return min((needed ^ found) - ({POLICY[1]} if has_policy else set()), default=None)
