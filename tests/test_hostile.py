@@ -18,7 +18,7 @@ from tcmrl_cli.frame import run
 
 import tcmrl_data
 from tcmrl_data import TcmrlError, open_dataset, verify_dataset
-from tcmrl_data.verification import making_again
+from tcmrl_data.verification import repair as repair_module
 from tcmrl_data.verification.description import Finding
 from tests.hostile.arrays import CHUNKS
 from tests.hostile.case import Case
@@ -233,7 +233,7 @@ def test_a_repair_or_gc_of_a_hostile_dataset_leads_nowhere(
     forge: Forge, case: Case, two_parts: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Parts come from the sound dataset, so that no case takes the time of a training."""
-    monkeypatch.setattr(making_again, "build_dataset", copies_of(two_parts))
+    monkeypatch.setattr(repair_module, "build_dataset", copies_of(two_parts))
     case.damage(forge)
     before = files_of(forge.outside)
     with bounded(forge):

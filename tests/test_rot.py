@@ -13,7 +13,7 @@ from tcmrl_data.store.keys import PARTS
 from tcmrl_data.store.manifest import MANIFEST, restore_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.tables import TASKS
-from tcmrl_data.verification import making_again
+from tcmrl_data.verification import repair as repair_module
 from tests.hostile.datasets import base, copies_of
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
@@ -73,7 +73,7 @@ def test_rot_is_named_and_repaired(
     sound: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rounds: int
 ) -> None:
     """One damage at a time is named; tables are repaired one by one, parts of a round together."""
-    monkeypatch.setattr(making_again, "build_dataset", copies_of(sound))
+    monkeypatch.setattr(repair_module, "build_dataset", copies_of(sound))
     folder = tmp_path / "copy"
     shutil.copytree(sound, folder)
     good, chance, cases = content(folder), random.Random(rounds), 0
