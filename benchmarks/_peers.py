@@ -15,8 +15,8 @@ import numpy.typing as npt
 import torch
 
 import tcmrl_data
-from tcmrl_data.interchange.formats.minari import dataset_id
-from tcmrl_data.interchange.views.sb3_buffer import to_sb3_buffer
+from tcmrl_data.interchange.minari import dataset_id
+from tcmrl_data.interchange.sb3 import to_sb3_buffer
 
 Draw = Callable[[], object]
 Draws = Mapping[str, Draw]

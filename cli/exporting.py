@@ -63,7 +63,7 @@ def export(
       MINARI_DATASETS_PATH=minari minari list local
     """
     import tcmrl_data
-    from tcmrl_data.interchange.formats.new_folder import staging_folder
+    from tcmrl_data.interchange.exporting import staging_folder
 
     opened = tcmrl_data.open_dataset(dataset)
     place = opened.path if opened.path.name not in ("", "..") else opened.path.resolve()

@@ -59,7 +59,7 @@ def import_data(
 ) -> None:
     """Make a dataset from FILE… of FORMAT.
 
-    Files are read without running code of them, and without following links out of them. What they do not say
+    Files are read without running code of them, and without reading other files. What they do not say
     stays open: seeds, policies and reference returns. A stopped import goes on when the command is run again.
 
     \b

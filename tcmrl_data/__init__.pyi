@@ -52,13 +52,13 @@ from .foundation.seeding import NO_TASK as NO_TASK
 from .foundation.seeding import Purpose as Purpose
 from .foundation.seeding import keyed_generator as keyed_generator
 from .foundation.seeding import keyed_seed as keyed_seed
+from .interchange.exporting import FORMATS as FORMATS
 from .interchange.exporting import ExportReport as ExportReport
 from .interchange.exporting import export_dataset as export_dataset
-from .interchange.formats.base import FORMATS as FORMATS
 from .interchange.importing import ImportReport as ImportReport
 from .interchange.importing import import_dataset as import_dataset
-from .interchange.readers.base import READERS as READERS
-from .interchange.recording import DatasetRecorder as DatasetRecorder
+from .interchange.reader import READERS as READERS
+from .interchange.recorder import DatasetRecorder as DatasetRecorder
 from .operations.apply import apply_operation as apply_operation
 from .operations.derive import Derived as Derived
 from .operations.derive import derive_dataset as derive_dataset

@@ -27,9 +27,9 @@ from tcmrl_data import (
     open_sampler,
 )
 from tcmrl_data.foundation.errors import MissingPackageError, SelectionError, StoreError
-from tcmrl_data.interchange.views.sb3_buffer import to_sb3_buffer
-from tcmrl_data.interchange.views.tensordict import to_tensordict, view_steps
-from tcmrl_data.interchange.views.torch_dataset import TrajectoryDataset
+from tcmrl_data.interchange.sb3 import to_sb3_buffer
+from tcmrl_data.interchange.tensordict import to_tensordict, view_steps
+from tcmrl_data.interchange.torch_dataset import TrajectoryDataset
 from tests.conftest import TASKS
 
 

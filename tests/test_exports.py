@@ -15,8 +15,8 @@ import pytest
 from tcmrl_data import FORMATS, Dataset, Trajectory, export_dataset, import_dataset, open_dataset
 from tcmrl_data.foundation.disk import lock_file
 from tcmrl_data.foundation.errors import LockedError, SelectionError, StoreError, TaskError
-from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS
-from tcmrl_data.interchange.formats.new_folder import LOCK, staging_folder
+from tcmrl_data.interchange.exporting import LOCK, staging_folder
+from tcmrl_data.interchange.hdf5 import EPISODE_ARRAYS
 from tests.conftest import TASKS
 from tests.test_adapters import terminated_early
 from tests.test_interchange import assert_equal

@@ -10,7 +10,7 @@ import pytest
 
 from tcmrl_data import Trajectory, import_dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.readers.restricted_pickle import PickleRefusedError, unpickle_array
+from tcmrl_data.interchange.idaq_npy import PickleRefusedError, unpickle_array
 from tests.made_up import trajectory
 
 STEPS = 5
@@ -61,6 +61,19 @@ def test_published_files_become_a_dataset(tmp_path: Path) -> None:
     assert verify_dataset(found.folder, level="deep").findings == ()
 
 
+def test_links_are_followed(tmp_path: Path) -> None:
+    """As the cache of a hub keeps files: a linked folder, linked and hard-linked files."""
+    made = [saved(tmp_path / f"blobs/{number}.npy", trajectory(STEPS, seed=number)) for number in range(3)]
+    (tmp_path / "d/goal_idx0").mkdir(parents=True)
+    (tmp_path / "d/goal_idx0/trj_evalsample0_step0.npy").symlink_to(made[0])
+    (tmp_path / "d/goal_idx0/trj_evalsample1_step0.npy").hardlink_to(made[1])
+    (tmp_path / "other").mkdir()
+    made[2].rename(tmp_path / "other/trj_evalsample0_step0.npy")
+    (tmp_path / "d/goal_idx1").symlink_to(tmp_path / "other")
+    report = import_dataset("idaq-npy", [tmp_path / "d"], tmp_path / "data")
+    assert (report.tasks, report.episodes) == (2, 3)
+
+
 def test_the_deterministic_policy_can_be_chosen(tmp_path: Path) -> None:
     tasks(tmp_path / "cheetah")
     saved(tmp_path / "cheetah/goal_idx0/trj_eval0_step0.npy", trajectory(STEPS, seed=7), dtype=np.float32)
@@ -104,7 +117,7 @@ def test_a_shape_beyond_the_bytes_is_refused() -> None:
     data = pickle.dumps(np.zeros(3), protocol=3)  # without frames, whose lengths would tell
     assert data.count(b"K\x01K\x03\x85") == 1
     forged = data.replace(b"K\x01K\x03\x85", b"K\x01\x8a\x06\x00\x00\x00\x00\x00\x01\x85")
-    with pytest.raises(PickleRefusedError, match="without its 8796093022208 bytes"):
+    with pytest.raises(PickleRefusedError, match="without their 8796093022208 bytes"):
         unpickle_array(forged)
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from tcmrl_data import Dataset, export_dataset, import_dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.formats.minari import dataset_id
+from tcmrl_data.interchange.minari import dataset_id
 from tests.conftest import TASKS
 from tests.test_interchange import assert_equal
 

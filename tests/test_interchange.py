@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from tcmrl_data import Dataset, Trajectory, export_dataset
 from tcmrl_data.foundation.errors import SelectionError, StoreError
-from tcmrl_data.interchange.formats.base import FORMATS
-from tcmrl_data.interchange.formats.hdf5 import EPISODE_ARRAYS, read_hdf5
+from tcmrl_data.interchange.exporting import FORMATS
+from tcmrl_data.interchange.hdf5 import EPISODE_ARRAYS, read_hdf5
 from tests.conftest import TASKS
 from tests.strategies import trajectories
 

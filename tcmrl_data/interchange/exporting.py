@@ -1,18 +1,95 @@
-"""Export: a selection of a dataset in the format of another library."""
+"""Export: a selection of a dataset in the format of another library, and the base class of formats.
 
-from collections.abc import Sequence
+A format is a plug-in that writes one task. Staging, syncing, resuming and publishing of the folder are here.
+"""
+
+import abc
+import contextlib
+import importlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any, ClassVar
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.envs.tasks import Split
+from tcmrl_data.envs.tasks import Split, Task
+from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import canonical_json, digest
-from tcmrl_data.interchange.formats.base import FORMATS, ExportProgress, Format, no_progress
-from tcmrl_data.interchange.formats.new_folder import new_folder, require_free
-from tcmrl_data.interchange.optional import require_packages
+from tcmrl_data.foundation.disk import (
+    disk,
+    lock_file,
+    make_folders,
+    move_into_place,
+    named_errors,
+    remove_tree,
+    replace_file,
+    require_room,
+    sync_files,
+    write_file,
+)
+from tcmrl_data.foundation.errors import MissingPackageError, StorageError, StoreError
+from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.recipe.about import AND
+from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.tables import task_line
+
+REMEDY = "nothing was exported; make room or choose an --out on another disk, then export again"
+FILE_BYTES = 2**16
+"""Bytes reserved for a file's content other than episodes."""
+
+COPIES = 4
+"""A step is written at most this often: in its episode, and flat with its two observations."""
+
+EPISODE_BYTES = 2**15
+"""Room for the records that HDF5 keeps of an episode's arrays; Minari's take 16 kB."""
+
+CLAIM, LOCK, FINISHED, OPEN = "export", "lock", "finished", "open"
+"""In the staging folder: what is exported, the lock, finished tasks, and the task that is being written."""
+
+
+class Format(abc.ABC):
+    """Writes datasets task by task; a plug-in of the group `tcmrl.formats`, made without arguments.
+
+    `export_dataset` calls the methods. It stages, syncs and publishes what they write, so that an export
+    appears whole or not at all, and a stopped one goes on behind its last finished task. Optional libraries
+    are imported inside methods, so that other formats work without them.
+    """
+
+    name: ClassVar[str]
+    optional_packages: ClassVar[tuple[str, ...]] = ()
+    """Modules that the methods import and that an installation without extras lacks."""
+    extra: ClassVar[str | None] = None
+    """The extra that brings them, such as `tcmrl[minari]`."""
+
+    @abc.abstractmethod
+    def place(self, selection: Selection, task: Task) -> str:
+        """Path of a task's file or folder within the export, such as `task_00000.hdf5`."""
+
+    @abc.abstractmethod
+    def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
+        """Writes a task, and yields the key of every part when it is written.
+
+        Args:
+            selection: `selection.parts[task.index]` are the parts to write, in that order, one in memory at
+                a time.
+            task: one of the selection's.
+            path: a new path that ends in `place(selection, task)`; its parent exists.
+
+        Raises:
+            StoreError: the format cannot hold an episode.
+            StorageError: the disk refuses; the message names the file.
+        """
+
+    def accompanying(self, selection: Selection) -> Mapping[str, bytes]:
+        """Small files beside those of the tasks: path within the export, and content."""
+        return {}
+
+
+FORMATS = Registry("tcmrl.formats", "format", Format)
 
 
 @dataclass(frozen=True)
@@ -48,7 +125,7 @@ def export_dataset(
     snapshots: str = "all",
     tier: str | None = None,
     dry_run: bool = False,
-    progress: ExportProgress = no_progress,
+    progress: Callable[[int, int], None] | None = None,
 ) -> ExportReport:
     """Writes a selection of a dataset into a new folder, one part in memory at a time.
 
@@ -64,7 +141,7 @@ def export_dataset(
         snapshots: a rule of `Dataset.select`.
         tier: a quality tier instead of a rule.
         dry_run: check everything and write nothing.
-        progress: called as parts are written.
+        progress: called with the number of parts written and of all parts.
 
     Raises:
         UnknownNameError: there is no such format.
@@ -88,7 +165,7 @@ def export_dataset(
     require_packages(f"format {format_name!r}", exporter.optional_packages, exporter.extra)
     opened = dataset if isinstance(dataset, Dataset) else open_dataset(dataset)
     selection = opened.select(split=split, tasks=tasks, snapshots=snapshots, tier=tier)
-    require_free(out)
+    _require_free(out)
     if not dry_run:
         _write(exporter, selection, out, progress)
     entries = [opened.entry(key) for keys in selection.parts.values() for key in keys]
@@ -103,22 +180,117 @@ def export_dataset(
     )
 
 
-def _write(exporter: Format, selection: Selection, out: Path, progress: ExportProgress) -> None:
+def require_packages(what: str, packages: Sequence[str], extra: str | None) -> None:
+    """Imports packages that only some formats need.
+
+    Args:
+        what: needs them, such as `format 'minari'`.
+        packages: names of modules.
+        extra: what installs them, such as `tcmrl[minari]`; the modules' own names where None.
+
+    Raises:
+        MissingPackageError: one of them cannot be imported.
+    """
+    try:
+        for package in packages:
+            importlib.import_module(package)
+    except ImportError as error:
+        raise MissingPackageError(
+            f"{what} needs a package that is missing ({error}); pip install '{extra or ' '.join(packages)}'"
+        ) from None
+
+
+def task_attributes(selection: Selection, task: Task, *, layout: str, version: int) -> dict[str, Any]:
+    """Numbers and texts that name the task of a file and the dataset that it came from.
+
+    A dataset without a seed, such as an imported one, has no attribute `seed`.
+
+    Args:
+        selection: what is exported.
+        task: of the file.
+        layout: of the file, such as `tcmrl-hdf5`.
+        version: of the layout.
+    """
+    manifest = selection.dataset.manifest
+    attributes = {
+        "format": layout,
+        "format_version": version,
+        "environment": manifest.name,
+        "task": task.index,
+        "split": task.split,
+        "parameters": json.dumps(dict(task.parameters), sort_keys=True),
+        "dataset_root": manifest.root,
+        "recipe": json.dumps(manifest.recipe.unit_settings(), sort_keys=True),
+        "citation": manifest.recipe.about.citation,
+        "licence": AND.join(manifest.licences),
+    }
+    return attributes if manifest.seed is None else attributes | {"seed": manifest.seed}
+
+
+def stored_episodes(dataset: Dataset, key: PartKey, *, format_name: str) -> Sequence[Trajectory]:
+    """The episodes of a part, for a format that cannot hold one without steps.
+
+    Raises:
+        StoreError: an episode has no steps.
+    """
+    trajectories = dataset.trajectories(*key)
+    for index, trajectory in enumerate(trajectories):
+        if not len(trajectory):
+            raise StoreError(
+                f"{dataset.file_of(key)}: episode {index} has no steps, which {format_name} cannot hold; "
+                "export with --format hdf5"
+            )
+    return trajectories
+
+
+def require_room_for(file: Path, trajectories: Sequence[Trajectory] = ()) -> None:
+    """Checks that a file can take episodes; HDF5 leaves a broken process behind where it cannot.
+
+    Args:
+        file: written next, or about to be made.
+        trajectories: what it takes; none where only the file itself is to be made.
+
+    Raises:
+        StorageError: the disk refuses.
+    """
+    num_bytes = FILE_BYTES + EPISODE_BYTES * len(trajectories)
+    for trajectory in trajectories:
+        arrays = (trajectory.observations, trajectory.actions, trajectory.rewards, trajectory.terminated)
+        all_arrays = (*arrays, trajectory.truncated, *trajectory.extras.values())
+        num_bytes += COPIES * sum(array.nbytes for array in all_arrays)
+    require_room(file, num_bytes, remedy=REMEDY)
+
+
+def staging_folder(out: Path) -> Path:
+    """Where the export to `out` is made, and kept when it is interrupted."""
+    return out.with_name(f".{out.name}.partial")
+
+
+def _require_free(out: Path) -> None:
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise StoreError(f"--out {out} exists and is not empty; choose another folder or remove it")
+
+
+def _write(
+    exporter: Format, selection: Selection, out: Path, progress: Callable[[int, int], None] | None
+) -> None:
     """Writes the tasks that no earlier attempt has finished."""
     total, done = sum(map(len, selection.parts.values())), 0
-    with new_folder(out, _claim(exporter, selection)) as folder:
+    with _staged(out, _claim(exporter, selection)) as staged:
         for task in selection.tasks:
             name = exporter.place(selection, task)
-            if folder.holds(name):
+            if (staged / FINISHED / name).exists():
                 done += len(selection.parts[task.index])
-                progress(done, total)
+                if progress is not None:
+                    progress(done, total)
                 continue
-            with folder.adding(name) as path:
+            with _adding(staged, name) as path:
                 for _ in exporter.write(selection, task, path):
                     done += 1
-                    progress(done, total)
+                    if progress is not None:
+                        progress(done, total)
         for name, content in exporter.accompanying(selection).items():
-            folder.add(name, content)
+            replace_file(staged / FINISHED / name, content, staging=staged / OPEN)
 
 
 def _claim(exporter: Format, selection: Selection) -> bytes:
@@ -133,3 +305,72 @@ def _claim(exporter: Format, selection: Selection) -> bytes:
             "parts": digest(ids),
         }
     )
+
+
+@contextlib.contextmanager
+def _staged(out: Path, claim: bytes) -> Iterator[Path]:
+    """Gives the staging folder, whose finished files are moved to `out` at the end.
+
+    After an error nothing is left. After an interruption or a crash, what was finished is kept for the next
+    attempt with the same claim.
+
+    Raises:
+        StoreError: `out` exists and is not empty, or something else lies where the export is staged.
+        LockedError: another process exports to `out`.
+        StorageError: the disk refuses.
+    """
+    staged = staging_folder(out)
+    try:
+        with named_errors(out, remedy=REMEDY):
+            out.parent.mkdir(parents=True, exist_ok=True)
+            is_foreign = staged.exists() and not (staged / LOCK).exists() and any(staged.iterdir())
+            if staged.is_symlink() or is_foreign:
+                raise StoreError(f"{staged} is in the way, where exports are staged; remove it")
+            staged.mkdir(exist_ok=True)
+            with lock_file(staged / LOCK, f"the export {out}"):
+                try:
+                    _take_up(staged, claim)
+                    yield staged
+                    if not move_into_place(staged / FINISHED, out):
+                        raise StoreError(
+                            f"--out {out} appeared meanwhile; choose another folder or remove it"
+                        )
+                except Exception:
+                    remove_tree(staged)
+                    raise
+                remove_tree(staged)
+    except StorageError as error:
+        text = str(error)
+        for inner in (staged / OPEN, staged / FINISHED, staged):
+            text = text.replace(str(inner), str(out))
+        raise StorageError(text) from None
+
+
+def _take_up(staged: Path, claim: bytes) -> None:
+    """Keeps what an attempt with the same claim has finished, and nothing of any other."""
+    file = staged / CLAIM
+    try:
+        if read_plain_file(file, limit=len(claim)) == claim:
+            return
+    except (OSError, ValueError):
+        pass  # none, or of another export
+    file.unlink(missing_ok=True)
+    for folder in (staged / FINISHED, staged / OPEN):
+        remove_tree(folder)
+    make_folders(staged / FINISHED)
+    write_file(file, claim)
+    disk.sync(staged)
+
+
+@contextlib.contextmanager
+def _adding(staged: Path, name: str) -> Iterator[Path]:
+    """Gives the path at which to write a task; it is forced to disk and counts as finished at the end."""
+    folder = staged / OPEN
+    remove_tree(folder)
+    path, target = folder / name, staged / FINISHED / name
+    path.parent.mkdir(parents=True)
+    yield path
+    sync_files(folder, [path] if path.is_file() else filter(Path.is_file, path.rglob("*")))
+    make_folders(target.parent)
+    disk.rename(path, target)
+    disk.sync(target.parent)

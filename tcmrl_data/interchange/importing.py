@@ -2,35 +2,30 @@
 
 import dataclasses
 import functools
+import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, digest
 from tcmrl_data.foundation.errors import StoreError, TaskError
-from tcmrl_data.foundation.plain_files import one_line, read_plain_file
+from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
 from tcmrl_data.foundation.records import hidden_text, validate_table
-from tcmrl_data.interchange.optional import require_packages
-from tcmrl_data.interchange.readers.base import READERS, Reader, ReadPart, Say, say_nothing
-from tcmrl_data.interchange.readers.source_files import path_digest
-from tcmrl_data.interchange.survey import Survey
+from tcmrl_data.interchange.exporting import require_packages
+from tcmrl_data.interchange.reader import READERS, Reader, ReadPart, Say
 from tcmrl_data.operations.assembly import Assembly, derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.recipe import Recipe, bound_recipe, check_licence, foreign_recipe
-from tcmrl_data.store.keys import MAIN_RUN, PartKey, check_plan
+from tcmrl_data.store.keys import MAIN_RUN, MAX_ARRAYS, MAX_INDEX, PartKey, check_plan
 from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part import DATA_VERSION, PartRecord
+from tcmrl_data.store.part import DATA_VERSION, STANDARD_ARRAYS, PartRecord
 from tcmrl_data.store.tables import parse_task_file, task_line
-
-ImportProgress = Callable[[int, int], None]
-"""Called with the number of parts published and of all parts."""
-
-
-def no_progress(done: int, total: int) -> None:
-    """Ignores the progress of an import."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +72,7 @@ def import_dataset(
     licence: str | None = None,
     url: str | None = None,
     dry_run: bool = False,
-    progress: ImportProgress = no_progress,
+    progress: Callable[[int, int], None] | None = None,
 ) -> ImportReport:
     """Makes a dataset from the files of another program.
 
@@ -102,7 +97,7 @@ def import_dataset(
         licence: of the data, an SPDX expression; recorded as their origin, like `url`.
         url: where the data come from.
         dry_run: read and check only.
-        progress: called as parts are published.
+        progress: called with the number of parts published and of all parts.
 
     Raises:
         UnknownNameError: there is no such reader or environment.
@@ -130,7 +125,7 @@ def import_dataset(
     source = _Source(reader, [Path(path) for path in paths], first_task=task)
     digests = source.digests()
     notes: list[str] = []
-    survey = Survey()
+    survey = _Survey()
     for path, part in source.parts(notes.append):
         try:
             survey.add(part)
@@ -172,6 +167,89 @@ def import_dataset(
     return dataclasses.replace(report, root=manifest.root)
 
 
+@dataclass
+class _Survey:
+    """Sums and sizes of the parts that were added.
+
+    Attributes:
+        keys: of the parts.
+        tasks: as the files describe them, by index.
+        horizon: steps of the longest episode.
+        extras: dtypes of the per-step arrays that all episodes have, by name.
+    """
+
+    keys: set[PartKey] = field(default_factory=set)
+    tasks: dict[int, Task] = field(default_factory=dict)
+    episodes: int = 0
+    steps: int = 0
+    horizon: int = 0
+    observation_dim: int = 0
+    action_dim: int = 0
+    _extras: dict[str, str] | None = None
+
+    @property
+    def extras(self) -> dict[str, str]:
+        """Dtypes of the per-step arrays that all episodes have, by name."""
+        return dict(sorted((self._extras or {}).items()))
+
+    def steps_of_tasks(self) -> list[int]:
+        """Number of snapshot steps of every task."""
+        return list(Counter(key.task for key in self.keys).values())
+
+    def add(self, part: ReadPart) -> None:
+        """Adds a part.
+
+        Raises:
+            StoreError: it stands in the files twice, or does not fit the parts before it.
+        """
+        assert part.task is not None
+        key = PartKey(part.task, part.step)
+        if not 0 <= min(key.task, key.step) <= max(key.task, key.step) < MAX_INDEX:
+            raise StoreError(f"{key}: task and step must be from 0 to {MAX_INDEX - 1}")
+        if key in self.keys:
+            raise StoreError(
+                f"{key} is in the files twice; give every file its task, or import them apart and merge"
+            )
+        self.keys.add(key)
+        self._add_task(part)
+        for trajectory in part.trajectories:
+            sizes = (trajectory.observations.shape[1], trajectory.actions.shape[1])
+            if min(sizes) < 1:
+                raise StoreError(f"{key}: observations and actions have {sizes} columns, 1 is the least")
+            if self.episodes and sizes != (self.observation_dim, self.action_dim):
+                raise StoreError(
+                    f"{key}: observations and actions have {sizes} columns, those of the parts before "
+                    f"{(self.observation_dim, self.action_dim)}"
+                )
+            self.observation_dim, self.action_dim = sizes
+            self.episodes += 1
+            self.steps += len(trajectory)
+            self.horizon = max(self.horizon, len(trajectory))
+            found = self.named_types({name: array.dtype for name, array in trajectory.extras.items()})
+            before = found if self._extras is None else self._extras
+            self._extras = dict(found.items() & before.items())
+            if len(self._extras) > MAX_ARRAYS - len(STANDARD_ARRAYS):
+                raise StoreError(
+                    f"{key}: has {len(found)} further arrays, a part has at most {MAX_ARRAYS} in all"
+                )
+
+    @staticmethod
+    def named_types(types: Mapping[str, Any]) -> dict[str, str]:
+        """The names of dtypes."""
+        return {name: str(np.dtype(dtype)) for name, dtype in types.items()}
+
+    def _add_task(self, part: ReadPart) -> None:
+        assert part.task is not None
+        hidden = hidden_text(dict(part.about.parameters))
+        if hidden is not None:
+            place = printable(hidden)[:200]
+            raise StoreError(f"task {part.task}: parameters {place} hold control characters")
+        task = Task(part.task, part.about.split or "train", dict(part.about.parameters))
+        known = self.tasks.setdefault(part.task, task)
+        if known != task:
+            raise StoreError(f"task {part.task}: two files give it different parameters or splits")
+
+
 @dataclass(frozen=True)
 class _Plan:
     """What the parts of an import have in common."""
@@ -193,9 +271,9 @@ class _Source:
         """Names and digests of all paths."""
         if not self.paths:
             raise StoreError("no file is named; name at least one")
-        return [path_digest(path, self.reader.files(path)) for path in self.paths]
+        return [_path_digest(path, self.reader.files(path)) for path in self.paths]
 
-    def parts(self, say: Say = say_nothing) -> Iterator[tuple[Path, ReadPart]]:
+    def parts(self, say: Say | None = None) -> Iterator[tuple[Path, ReadPart]]:
         """The parts of all paths, with their paths."""
         for position, path in enumerate(self.paths):
             own: set[int] = set()
@@ -212,7 +290,7 @@ class _Source:
 
 
 def _plan(
-    survey: Survey, known: Mapping[int, Task], *, environment: str | None, licence: str | None
+    survey: _Survey, known: Mapping[int, Task], *, environment: str | None, licence: str | None
 ) -> _Plan:
     """The recipe and the tasks of an import.
 
@@ -261,7 +339,12 @@ def _plan(
 
 
 def _publish(
-    assembly: Assembly, source: _Source, plan: _Plan, progress: ImportProgress, *, total: int
+    assembly: Assembly,
+    source: _Source,
+    plan: _Plan,
+    progress: Callable[[int, int], None] | None,
+    *,
+    total: int,
 ) -> None:
     """Writes the parts that no earlier attempt has written."""
     tasks = {task.index: task for task in plan.tasks}
@@ -269,7 +352,8 @@ def _publish(
         assert part.task is not None
         task = tasks[part.task]
         assembly.write(PartKey(task.index, part.step), functools.partial(_make_part, plan, task, part))
-        progress(done, total)
+        if progress is not None:
+            progress(done, total)
 
 
 def _make_part(plan: _Plan, task: Task, part: ReadPart) -> tuple[PartRecord, bytes]:
@@ -295,3 +379,25 @@ def _tasks_of_file(file: Path) -> dict[int, Task]:
     except (OSError, ValueError) as error:
         raise TaskError(f"--tasks {file} cannot be read ({one_line(error)})") from None
     return {task.index: task for task in parse_task_file(data, file)}
+
+
+def _path_digest(path: Path, files: Sequence[Path]) -> list[str]:
+    """Name and sha256 of a path of the command line, as they stand in the origin of a run.
+
+    A folder's is that of the names and digests of the files that are read of it, since there may be many.
+
+    Raises:
+        StoreError: a file cannot be read.
+    """
+    name = printable(path.resolve().name)
+    if len(files) == 1 and files[0] == path.resolve():
+        return [name, _file_digest(files[0])]
+    return [name, digest([[file.relative_to(path).as_posix(), _file_digest(file)] for file in files])]
+
+
+def _file_digest(file: Path) -> str:
+    try:
+        with file.open("rb") as opened:
+            return hashlib.file_digest(opened, "sha256").hexdigest()
+    except OSError as error:
+        raise StoreError(f"{printable(str(file))} cannot be read ({one_line(error)})") from None

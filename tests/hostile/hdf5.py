@@ -2,7 +2,6 @@
 
 import json
 import os
-import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -113,20 +112,6 @@ def ours(**attributes: Any) -> Make:
     return make
 
 
-def endless_heap(entry: bytes) -> Make:
-    """Our own layout with a text whose heap the library would walk for ever, or beyond its end."""
-
-    def make(places: Places) -> Path:
-        path = ours()(places)
-        content = bytearray(path.read_bytes())
-        first = content.index(b"GCOL") + 16
-        content[first : first + len(entry)] = entry
-        path.write_bytes(content)
-        return path
-
-    return make
-
-
 def shortened(share: float) -> Make:
     def make(places: Places) -> Path:
         path = hdf5(lambda file, _: None, without="")(places)
@@ -202,9 +187,6 @@ HDF5: dict[str, Make] = {
     "hdf5: parameters that write to a terminal": ours(parameters=json.dumps({"a": "\x1b]0;owned\x07"})),
     "hdf5: an early flag": ours(early=True),
     "hdf5: an attribute of many": ours(format_version=np.ones(1000)),
-    "hdf5: a heap without end": endless_heap(bytes(16)),
-    "hdf5: a heap with an entry of 8 TiB": endless_heap(struct.pack("<HHIQ", 1, 1, 0, TEBI)),
-    "hdf5: a heap with an entry that wraps": endless_heap(struct.pack("<HHIQ", 1, 1, 0, 2**64 - 16)),
     "hdf5: no HDF5": not_hdf5,
     "hdf5: a pipe": pipe_file,
 } | {f"hdf5: cut at {share}": shortened(share) for share in (0.01, 0.3, 0.6, 0.99)}

@@ -30,19 +30,7 @@ def minari(change: Callable[[Path, Places], object]) -> Make:
     return make
 
 
-def linked_content(data: Path, places: Places) -> None:
-    (data / "main_data.hdf5").rename(places.secret)
-    (data / "main_data.hdf5").symlink_to(places.secret)
-
-
-def linked_data(data: Path, places: Places) -> None:
-    data.rename(places.secret)
-    data.symlink_to(places.secret)
-
-
 MINARI: dict[str, Make] = {
-    "minari: linked content": minari(linked_content),
-    "minari: a linked folder": minari(linked_data),
     "minari: metadata in brackets": minari(
         lambda data, _: (data / "metadata.json").write_text("[" * 100_000)
     ),

@@ -74,6 +74,13 @@ def long(value: int) -> bytes:
     return b"\x8a\x08" + data
 
 
+def objects_at(pointers: bytes) -> bytes:
+    """An array whose type says objects and, by its flags, that they are stored as plain bytes."""
+    return npy(
+        "(2, 4)", reconstructed(b"K\x01K\x04\x86", text("O8"), b"C" + bytes([len(pointers)]) + pointers)
+    )
+
+
 CODE: dict[str, bytes] = {
     "builtins.eval": npy("(2, 4)", global_call("builtins", "eval", text("1"))),
     "a file by numpy": npy("(2, 4)", global_call("numpy", "fromfile", text("/etc/passwd"))),
@@ -115,6 +122,14 @@ CODE: dict[str, bytes] = {
         )
     ),
     "values that are not finite": objects(rows(np.full(2, np.inf), np.zeros(1), 0.0, np.zeros(2))),
+    "an array that was never filled": npy(
+        "(0, 4)", b"\x80\x03cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85C\x01b\x87\x81."
+    ),
+    "a pointer in place of an object": objects_at(b"AAAAAAAA"),
+    "other defaults for a function": npy(
+        "(2, 4)",
+        b"\x80\x03cnumpy.core.multiarray\n_reconstruct\nN}X\x0c\x00\x00\x00__defaults__N)s\x86b.",
+    ),
     "one array in many rows": npy(
         "(200000, 4)",
         pickle.dumps(rows(np.zeros(50_000), np.zeros(1), 0.0, np.zeros(50_000), length=200_000)),
@@ -150,19 +165,6 @@ def cut(share: float) -> Make:
     return make
 
 
-def linked_file(places: Places) -> Path:
-    saved(places.secret, trajectory(5, seed=0))
-    episode_file(places).symlink_to(places.secret)
-    return places.folder
-
-
-def linked_folder(places: Places) -> Path:
-    saved(places.secret.parent / "trj_evalsample0_step0.npy", trajectory(5, seed=0))
-    places.folder.mkdir()
-    (places.folder / "goal_idx0").symlink_to(places.secret.parent)
-    return places.folder
-
-
 def pipe(places: Places) -> Path:
     os.mkfifo(episode_file(places))
     return places.folder
@@ -173,8 +175,6 @@ IDAQ: dict[str, Make] = (
     | {f"npy: cut at {share}": cut(share) for share in (0.2, 0.5, 0.99)}
     | {
         "npy: code": runs_code,
-        "npy: a link": linked_file,
-        "npy: a linked folder": linked_folder,
         "npy: a pipe": pipe,
     }
 )

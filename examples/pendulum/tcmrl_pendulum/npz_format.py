@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.tasks import Task
-from tcmrl_data.interchange.formats.base import Format
+from tcmrl_data.interchange.exporting import Format
 from tcmrl_data.store.keys import PartKey
 
 

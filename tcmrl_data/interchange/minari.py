@@ -9,13 +9,18 @@ more than actions, as Minari has them: the first row is of the reset.
 else of the environment's expert, else of the best snapshot, and `ref_max_score_source` says of which. Data
 that were imported have neither. The metadata have under `tcmrl` a JSON object that names task and dataset.
 `recover_environment` gives the task back as a Gymnasium environment.
+
+Datasets are read without Minari, from `data/metadata.json` and `data/main_data.hdf5`; each is one task.
+Observations and actions are arrays, or a flat dictionary of arrays, which are put side by side. Infos of
+rank 1 become further per-step arrays without their first row, which is the reset's; others are left out.
 """
 
 import contextlib
 import json
 import os
+import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, final
@@ -32,10 +37,26 @@ from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import make_environment
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
+from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
-from tcmrl_data.interchange.formats.base import Format
-from tcmrl_data.interchange.formats.describing import stored_episodes, task_attributes
-from tcmrl_data.interchange.formats.new_folder import require_room_for
+from tcmrl_data.interchange.exporting import Format, require_room_for, stored_episodes, task_attributes
+from tcmrl_data.interchange.hdf5_file import Hdf5File
+from tcmrl_data.interchange.reader import (
+    EpisodeCuts,
+    FileTask,
+    ObservationOptions,
+    Reader,
+    ReadPart,
+    Say,
+    described_task,
+    episode_of,
+    extras_of,
+    last_flags,
+    parts_of_task,
+    require_file,
+)
 from tcmrl_data.recipe.about import AND
 from tcmrl_data.store.keys import PartKey
 
@@ -45,8 +66,11 @@ if TYPE_CHECKING:
 LAYOUT, FORMAT_VERSION = "tcmrl-minari", 1
 METADATA_KEY = "tcmrl"
 STEP_ATTRIBUTE = "snapshot_step"
+METADATA, CONTENT = "metadata.json", "main_data.hdf5"
 NEEDED_BY_TASKS = ("tcmrl", "gymnasium", "mujoco", "metaworld")
 """Packages without which a task cannot be made again."""
+
+_EPISODE = re.compile(r"episode_([0-9]{1,9})")
 
 
 @final
@@ -210,3 +234,83 @@ def _buffer(dataset: Dataset, key: PartKey, episode: int, trajectory: Trajectory
             for name, values in trajectory.extras.items()
         },
     )
+
+
+@final
+class MinariReader(Reader):
+    """A path is the folder of a dataset, such as `~/.minari/datasets/mujoco/hopper/medium-v0`."""
+
+    name = "minari"
+    Options = ObservationOptions
+    options: ObservationOptions
+
+    def files(self, path: Path) -> list[Path]:
+        for folder in (path / "data", path):
+            if (folder / METADATA).is_file():
+                files = [folder / name for name in (CONTENT, METADATA)]
+                for file in files:
+                    require_file(file)
+                return files
+        raise StoreError(f"{path}: holds no data/{METADATA}; name the folder of a Minari dataset")
+
+    def read(self, path: Path, say: Say | None = None) -> Iterator[ReadPart]:
+        content, metadata = self.files(path)
+        task, about = _task(metadata)
+        cuts = EpisodeCuts()
+        with Hdf5File(content) as file:
+            names = [name for name in file.members("/") if _EPISODE.fullmatch(name)]
+            names.sort(key=lambda name: int(name.removeprefix("episode_")))
+            episodes = (
+                (file.index(f"/{name}", STEP_ATTRIBUTE, 0), self._episode(file, f"/{name}", cuts))
+                for name in names
+            )
+            yield from parts_of_task(episodes, task, about, place=str(content))
+        cuts.tell(say, path)
+
+    def _episode(self, file: Hdf5File, group: str, cuts: EpisodeCuts) -> Trajectory:
+        place = f"{file.path}: {group}"
+        flags = last_flags(file.array(f"{group}/terminations"), file.array(f"{group}/truncations"), place)
+        rewards = file.array(f"{group}/rewards")
+        return episode_of(
+            _columns(file, f"{group}/observations", self.options.keys()),
+            _columns(file, f"{group}/actions", None),
+            rewards,
+            ended=flags,
+            extras=_infos(file, group, steps=len(rewards)),
+            cuts=cuts,
+            place=place,
+        )
+
+
+def _task(file: Path) -> tuple[int | None, FileTask]:
+    """The task of a dataset that was exported here; nothing for any other."""
+    try:
+        values = parse_json(read_plain_file(file, limit=MAX_JSON_BYTES).replace(b"Infinity", b"0"))
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{file}: not Minari's metadata ({one_line(error)})") from None
+    if not isinstance(values, dict):
+        raise StoreError(f"{file}: not Minari's metadata (no table)")
+    if values.get("data_format", "hdf5") != "hdf5":
+        found = repr(values["data_format"])[:40]
+        raise StoreError(
+            f"{file}: data_format is {found}, only hdf5 is read; convert the dataset with Minari"
+        )
+    text = values.get(METADATA_KEY)
+    if text is None:
+        return None, FileTask()
+    return described_task(text, version=FORMAT_VERSION, place=str(file))
+
+
+def _columns(file: Hdf5File, path: str, keys: Sequence[str] | None) -> npt.NDArray[Any]:
+    """An array of (rows, columns), or those of a group side by side."""
+    return file.columns(path, keys or file.members(path)) if file.is_group(path) else file.array(path)
+
+
+def _infos(file: Hdf5File, group: str, *, steps: int) -> dict[str, npt.NDArray[Any]]:
+    """Infos that a part may have, without the row of the reset."""
+    if not file.is_group(f"{group}/infos"):
+        return {}
+    names = [name for name in file.members(f"{group}/infos") if file.rank(f"{group}/infos/{name}") == 1]
+    arrays = {name: file.array(f"{group}/infos/{name}") for name in names}
+    kept = {name: array[1:] if len(array) == steps + 1 else array for name, array in arrays.items()}
+    return extras_of({name: array for name, array in kept.items() if len(array) == steps})

@@ -1,25 +1,192 @@
-"""Episodes from rows as other libraries store them."""
+"""The base class of readers, the plug-ins of `tcmrl-data import`, and what they make episodes with.
 
+Files come from strangers. A reader runs no code of theirs, reads no file but those that are named, and
+decodes no more than a stated multiple of their size (`decoded_limit`).
+"""
+
+import abc
 import itertools
 import re
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, ClassVar
 
 import numpy as np
 import numpy.typing as npt
+from pydantic import BaseModel, ConfigDict
 
+from tcmrl_data.envs.tasks import Split
 from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.errors import StoreError, TrajectoryError
+from tcmrl_data.foundation.plain_files import file_problem, one_line, printable
+from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.store.keys import MAX_INDEX
 from tcmrl_data.store.part import ARRAY_NAME, STANDARD_ARRAYS
 
 Array = npt.NDArray[Any]
 
 _NAME = re.compile(ARRAY_NAME)
 
+FLOOR_BYTES = 4 * 2**20
+"""What may be decoded of a file whatever its size."""
+
+LARGEST_RATIO = 4
+"""Bytes that may be decoded for each byte of a file; numbers as the field records them seldom reach two."""
+
+Say = Callable[[str], None]
+"""Takes what a user should know of a file, such as episodes that were cut."""
+
+
+class ReaderOptions(BaseModel):
+    """Options of a reader, `--option NAME=VALUE` on the command line; readers add their own fields."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class ObservationOptions(ReaderOptions):
+    """Options of readers whose files may hold observations in several arrays.
+
+    Attributes:
+        observation_keys: names of the arrays that are put side by side, separated by commas; all that are
+            rows of numbers, sorted by name, where unset.
+    """
+
+    observation_keys: str | None = None
+
+    def keys(self) -> tuple[str, ...] | None:
+        """The names, in order; None where unset."""
+        return None if self.observation_keys is None else tuple(self.observation_keys.split(","))
+
+
+@dataclass(frozen=True)
+class FileTask:
+    """What a file says of a task.
+
+    Attributes:
+        split: None where the file does not say.
+        parameters: empty where the file does not say.
+    """
+
+    split: Split | None = None
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class ReadPart:
+    """Episodes that become one part.
+
+    Attributes:
+        task: index of the task; None where the file does not say.
+        step: snapshot step; 0 where the file does not say.
+        trajectories: at least one; every episode ends with a flag, and no flag is set before.
+        about: what the file says of the task.
+    """
+
+    task: int | None
+    step: int
+    trajectories: Sequence[Trajectory]
+    about: FileTask = field(default_factory=FileTask)
+
+
+class Reader(abc.ABC):
+    """Reads datasets of one format; a plug-in of the entry point group `tcmrl.readers`.
+
+    Optional libraries are imported inside methods, so that other formats work without them.
+    """
+
+    name: ClassVar[str]
+    optional_packages: ClassVar[tuple[str, ...]] = ()
+    """Modules that the methods import and that an installation without extras lacks."""
+    extra: ClassVar[str | None] = None
+    """The extra that brings them, such as `tcmrl[parquet]`."""
+    Options: ClassVar[type[ReaderOptions]] = ReaderOptions
+
+    def __init__(self, options: ReaderOptions | None = None) -> None:
+        self.options = self.Options() if options is None else options
+
+    @abc.abstractmethod
+    def files(self, path: Path) -> list[Path]:
+        """The files that will be read for a path of the command line, sorted.
+
+        Raises:
+            StoreError: there is nothing of this format at the path.
+        """
+
+    @abc.abstractmethod
+    def read(self, path: Path, say: Say | None = None) -> Iterator[ReadPart]:
+        """Yields the parts of a path, one in memory at a time, in the same order every time.
+
+        What the file does not say stays open: `ReadPart` says how.
+
+        Args:
+            path: a file or folder, whichever the format has.
+            say: told once per file what was left out or cut.
+
+        Raises:
+            StoreError: the file is damaged, of another format, or too large for its size on disk; the message
+                names the file and the member.
+        """
+
+
+READERS = Registry("tcmrl.readers", "import format", Reader)
+
+
+def decoded_limit(file_bytes: int) -> int:
+    """Bytes that may be decoded of a file of this size."""
+    return FLOOR_BYTES + LARGEST_RATIO * file_bytes
+
+
+def require_file(path: Path) -> Path:
+    """The regular file that a path names or leads to.
+
+    Raises:
+        StoreError: it is missing or no regular file.
+    """
+    try:
+        resolved = path.resolve(strict=True)
+        problem = file_problem(resolved.stat())
+    except (OSError, RuntimeError) as error:
+        shown = printable(str(path))
+        raise StoreError(f"{shown} cannot be read ({one_line(error)}); name a file that can") from None
+    if problem is not None:
+        raise StoreError(f"{printable(str(path))} {problem}; name a file")
+    return resolved
+
+
+TASK_ATTRIBUTES = ("format_version", "task", "split", "parameters")
+"""What `described_task` reads of the attributes that exports write."""
+
+
+def described_task(attributes: Any, *, version: int, place: str) -> tuple[int, FileTask]:
+    """Index and description of the task that an exported file names.
+
+    Args:
+        attributes: numbers and texts by name, or JSON text of them.
+        version: of the format, which is read here.
+        place: the file, for error messages.
+
+    Raises:
+        StoreError: the file is of another version, or the attributes describe no task.
+    """
+    try:
+        found = parse_json(attributes.encode()) if isinstance(attributes, str) else attributes
+        written, index, split, text = (found[name] for name in TASK_ATTRIBUTES)
+        parameters: Any = parse_json(text.encode())
+    except (ValueError, KeyError, TypeError, AttributeError):
+        raise StoreError(f"{place}: its attributes do not describe a task") from None
+    if written != version:
+        raise StoreError(f"{place}: format_version {repr(written)[:40]} is not {version}, which is read here")
+    if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < MAX_INDEX:
+        raise StoreError(f"{place}: task is {repr(index)[:40]}, not an index")
+    if not isinstance(parameters, dict) or split not in ("train", "test"):
+        raise StoreError(f"{place}: parameters and split are not those of a task")
+    return index, FileTask("test" if split == "test" else "train", parameters)
+
 
 @dataclass
-class Cuts:
+class EpisodeCuts:
     """What was cut of a file's episodes.
 
     Attributes:
@@ -32,14 +199,15 @@ class Cuts:
     shortened: int = 0
     unflagged: int = 0
 
-    def sentences(self) -> list[str]:
-        """What a user should know; empty where nothing was cut."""
-        found = (
+    def tell(self, say: Say | None, path: Path) -> None:
+        """Says what a user should know, if anything was cut."""
+        for number, text in (
             (self.broken, "episodes end where next_observations are not the next row's observations"),
             (self.shortened, "episodes lose their last step, whose next observation the file does not have"),
             (self.unflagged, "episodes end without a flag and are marked as truncated, not terminated"),
-        )
-        return [f"{number:,} {text}" for number, text in found if number]
+        ):
+            if say is not None and number:
+                say(f"{path.name}: {number:,} {text}")
 
 
 def episodes_of_rows(
@@ -50,7 +218,7 @@ def episodes_of_rows(
     terminals: Array,
     timeouts: Array | None,
     next_observations: Array | None,
-    cuts: Cuts,
+    cuts: EpisodeCuts,
     place: str,
 ) -> list[Trajectory]:
     """The episodes of rows of steps that lie behind one another.
@@ -106,7 +274,7 @@ def episodes_of_rows(
             step = slice(start, stop)
             last = (bool(terminated[stop - 1]), bool(truncated[stop - 1]))
             trajectories.append(
-                episode(seen, actions[step], rewards[step], ended=last, cuts=cuts, place=place)
+                episode_of(seen, actions[step], rewards[step], ended=last, cuts=cuts, place=place)
             )
         start = end + 1
     if not trajectories:
@@ -114,14 +282,14 @@ def episodes_of_rows(
     return trajectories
 
 
-def episode(
+def episode_of(
     observations: Array,
     actions: Array,
     rewards: Array,
     *,
     ended: tuple[bool, bool],
     extras: Mapping[str, Array] | None = None,
-    cuts: Cuts,
+    cuts: EpisodeCuts,
     place: str,
 ) -> Trajectory:
     """One episode with its flags at the last step.
@@ -186,7 +354,7 @@ def joined_observations(observations: Array, following: Array, *, place: str) ->
     return np.concatenate([observations, following[-1:]])
 
 
-def last_flags(terminated: Array, truncated: Array | None, place: str) -> tuple[bool, bool]:
+def last_flags(terminated: Array, truncated: Array, place: str) -> tuple[bool, bool]:
     """The flags of an episode's last step.
 
     Raises:
@@ -194,7 +362,7 @@ def last_flags(terminated: Array, truncated: Array | None, place: str) -> tuple[
     """
     found = []
     for name, flags in (("terminated", terminated), ("truncated", truncated)):
-        values = np.zeros(1, bool) if flags is None else _flags(flags, len(flags), f"{place}: {name}")
+        values = _flags(flags, len(flags), f"{place}: {name}")
         if values[:-1].any():
             raise StoreError(f"{place}: {name} is set before the episode's last step")
         found.append(bool(values[-1:].any()))
@@ -218,13 +386,15 @@ def extras_of(arrays: Mapping[str, Array]) -> dict[str, Array]:
     return kept
 
 
-def parts_by_step(
-    episodes: Iterable[tuple[int, Trajectory]], *, place: str
-) -> Iterator[tuple[int, list[Trajectory]]]:
-    """Episodes of equal snapshot steps together; they must stand behind one another.
+def parts_of_task(
+    episodes: Iterable[tuple[int, Trajectory]], task: int | None, about: FileTask, *, place: str
+) -> Iterator[ReadPart]:
+    """The parts of a task, one for each snapshot step.
 
     Args:
-        episodes: steps and episodes, in the order of the file.
+        episodes: steps and episodes, in the order of the file; those of a step stand behind one another.
+        task: index of the task.
+        about: what the file says of it.
         place: the file, for error messages.
 
     Raises:
@@ -235,7 +405,7 @@ def parts_by_step(
         if step in done:
             raise StoreError(f"{place}: the episodes of step {step} do not stand behind one another")
         done.add(step)
-        yield step, [trajectory for _, trajectory in group]
+        yield ReadPart(task, step, [trajectory for _, trajectory in group], about)
     if not done:
         raise StoreError(f"{place}: holds no episode")
 

@@ -16,7 +16,7 @@ from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
-from tcmrl_data.interchange.readers.episodes import Cuts, episode
+from tcmrl_data.interchange.reader import EpisodeCuts, episode_of
 from tcmrl_data.operations.assembly import derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
@@ -216,12 +216,12 @@ class DatasetRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         if not actions:
             return
         place = f"{self._out}: episode {self.episodes}"
-        made = episode(
+        made = episode_of(
             np.stack(observations),
             np.stack(actions),
             np.array(rewards),
             ended=(terminated, truncated),
-            cuts=Cuts(),
+            cuts=EpisodeCuts(),
             place=place,
         )
         replace_file(self._file(self.episodes), self._make([made])[1], staging=self._out / STAGING)

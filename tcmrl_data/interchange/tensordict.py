@@ -27,7 +27,7 @@ def to_tensordict(selection: Selection) -> "TensorDict":
         MissingPackageError: tensordict is not installed.
 
     Example:
-        >>> from tcmrl_data.interchange.views.tensordict import to_tensordict
+        >>> from tcmrl_data.interchange.tensordict import to_tensordict
         >>> from torchrl.data import LazyTensorStorage, ReplayBuffer, SliceSampler  # doctest: +SKIP
         >>> data = to_tensordict(dataset.select(snapshots="last"))  # doctest: +SKIP
         >>> sampler = SliceSampler(slice_len=10, traj_key="episode")  # doctest: +SKIP

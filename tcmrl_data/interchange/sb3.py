@@ -27,7 +27,7 @@ def to_sb3_buffer(selection: Selection, task: int, *, device: str = "cpu") -> "R
         SelectionError: the selection does not hold the task, or no transition of it.
 
     Example:
-        >>> from tcmrl_data.interchange.views.sb3_buffer import to_sb3_buffer
+        >>> from tcmrl_data.interchange.sb3 import to_sb3_buffer
         >>> model.replay_buffer = to_sb3_buffer(dataset.select(snapshots="last"), task=7)  # doctest: +SKIP
         >>> model.train(gradient_steps=100)  # doctest: +SKIP
     """

@@ -1,14 +1,11 @@
 """HDF5 files of strangers: numbers and short texts of plain datasets, and nothing else.
 
-Links of any kind but hard ones, external and virtual storage, user-defined filters, and types without a fixed
-size are refused before they are followed. Compressed chunks are unpacked here first, up to the size that
-their dataset declares: the library would unpack whatever they hold. Heaps of texts are walked here first: an
-entry of no size would keep the library walking for ever.
+Links other than hard ones, and external and virtual storage, are refused before they are followed, since they
+may lead to other files. h5py reads the rest. It would unpack a chunk to whatever size it holds, so that
+compressed chunks are unpacked here first, up to the size that their dataset declares.
 """
 
 import contextlib
-import io
-import os
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,33 +18,26 @@ import numpy.typing as npt
 
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, printable
-from tcmrl_data.interchange.readers.source_files import decoded_limit, require_file
+from tcmrl_data.interchange.reader import (
+    TASK_ATTRIBUTES,
+    FileTask,
+    decoded_limit,
+    described_task,
+    require_file,
+)
 from tcmrl_data.store.keys import MAX_INDEX
 
-MOST_MEMBERS = 2**20
 LARGEST_ATTRIBUTE = 2**20
-LARGEST_HEAP = 2 * LARGEST_ATTRIBUTE
-HEAP, HEAP_HEADER, HEAP_ENTRY = b"GCOL", 16, 16
-"""A heap is HEAP, 4 bytes, and its size in 8; then entries of an index in 2 bytes, 6 bytes, and a size in 8,
-with that many bytes behind them, up to a multiple of 8. The entry of index 0 is the free rest with its header
-(HDF5 File Format Specification, III.E)."""
-
-NUMBERS = "biuf"
-"""Kinds of the types that are read: truth values, integers, floats."""
 
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32}
 """All others are either rare or code that is loaded from elsewhere."""
 
+NUMBERS = "biuf"
+"""Kinds of the types that are read: truth values, integers, floats."""
+
 _ERRORS = (
-    OSError,
-    RuntimeError,
-    KeyError,
-    ValueError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    MemoryError,
-    SystemError,
+    *(OSError, RuntimeError, KeyError, ValueError, TypeError),
+    *(AttributeError, OverflowError, MemoryError, SystemError),
 )
 """What h5py raises for damaged files."""
 
@@ -55,26 +45,16 @@ _ERRORS = (
 class Hdf5File:
     """An opened file; paths are absolute, such as `/episodes/000000/actions`.
 
-    Args:
-        path: the file.
-
     Raises:
         StoreError: it is missing or no HDF5; all methods raise it too, naming file and member.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._left = self._limit = decoded_limit(require_file(path).stat().st_size)
-        self._checked = _CheckedFile(path)
-        self._raw = self._checked.fileno()
-        try:
-            with self._named(""):
-                self._file = h5py.File(self._checked, "r", locking=False, rdcc_nbytes=2**20)
-                if self._file.id.get_create_plist().get_sizes() != (8, 8):
-                    raise ValueError("its addresses and sizes do not have 8 bytes")
-        except BaseException:
-            self._checked.close()
-            raise
+        self._size = require_file(path).stat().st_size
+        self._left = self._limit = decoded_limit(self._size)
+        with self._named(""):
+            self._file = h5py.File(path, "r", locking=False)
 
     def __enter__(self) -> Self:
         return self
@@ -84,7 +64,6 @@ class Hdf5File:
     ) -> None:
         with contextlib.suppress(*_ERRORS):
             self._file.close()
-        self._checked.close()
 
     def members(self, group: str) -> list[str]:
         """Names in a group, sorted."""
@@ -92,8 +71,6 @@ class Hdf5File:
             found = self._object(group)
             if not isinstance(found, h5py.Group):
                 raise ValueError("is no group")
-            if len(found) > MOST_MEMBERS:
-                raise ValueError(f"has {len(found)} members, more than {MOST_MEMBERS}")
             return sorted(name for name in found if isinstance(name, str))
 
     def holds(self, path: str) -> bool:
@@ -130,6 +107,39 @@ class Hdf5File:
             raise StoreError(f"{self.path}: {path} attribute {name} is {repr(value)[:40]}, not an index")
         return value
 
+    def task(self, *, version: int) -> tuple[int, FileTask]:
+        """The task that the attributes of an exported file name."""
+        attributes = {name: self.attribute("/", name) for name in TASK_ATTRIBUTES}
+        return described_task(attributes, version=version, place=str(self.path))
+
+    def rank(self, path: str) -> int | None:
+        """Number of dimensions of a dataset; None where there is none."""
+        with self._named(path):
+            found = self._object(path)
+            return len(found.shape or ()) if isinstance(found, h5py.Dataset) else None
+
+    def array(self, path: str) -> npt.NDArray[Any]:
+        """The values of a dataset, in the machine's byte order."""
+        with self._named(path):
+            found = self._object(path)
+            if not isinstance(found, h5py.Dataset):
+                raise ValueError("is missing" if found is None else "is no dataset")
+            if found.dtype.kind not in NUMBERS or found.dtype.itemsize > 8 or found.dtype.subdtype:
+                raise ValueError(f"is of type {found.dtype}, not of numbers")
+            if found.shape is None:
+                raise ValueError("has no shape")
+            if found.is_virtual or found.external:
+                raise ValueError("has its values in other files or datasets")
+            self._left -= found.nbytes
+            if self._left < 0:
+                raise ValueError(
+                    f"would take the values read beyond {self._limit} bytes, which the file's size does not "
+                    "justify; if you trust the file, write it again without compression (`h5repack -f NONE`)"
+                )
+            self._check_chunks(found)
+            values = np.asarray(found[()])
+            return values.astype(values.dtype.newbyteorder("="), copy=False)
+
     def columns(self, group: str, keys: Sequence[str]) -> npt.NDArray[Any]:
         """Datasets of a group side by side, as (rows, columns); those of rank 1 are one column."""
         members = [self.array(f"{group}/{key}") for key in keys]
@@ -140,35 +150,6 @@ class Hdf5File:
                 "observation_keys=A,B"
             )
         return np.concatenate(members, axis=1)
-
-    def rank(self, path: str) -> int | None:
-        """Number of dimensions of a dataset; None where there is none."""
-        with self._named(path):
-            found = self._object(path)
-            return len(found.shape or ()) if isinstance(found, h5py.Dataset) else None
-
-    def length(self, path: str) -> int:
-        """Number of rows of a dataset; 0 where there is none."""
-        with self._named(path):
-            found = self._object(path)
-            return int(found.shape[0]) if isinstance(found, h5py.Dataset) and found.shape else 0
-
-    def array(self, path: str) -> npt.NDArray[Any]:
-        """The values of a dataset, in the machine's byte order."""
-        with self._named(path):
-            found = self._object(path)
-            if not isinstance(found, h5py.Dataset):
-                raise ValueError("is missing" if found is None else "is no dataset")
-            self._check_form(found)
-            self._left -= found.nbytes
-            if self._left < 0:
-                raise ValueError(
-                    f"would take the values read beyond {self._limit} bytes, which the file's size does not "
-                    "justify; if you trust the file, write it again without compression (`h5repack -f NONE`)"
-                )
-            self._check_chunks(found)
-            values = np.asarray(found[()])
-            return values.astype(values.dtype.newbyteorder("="), copy=False)
 
     def _object(self, path: str) -> Any:
         """The group or dataset at a path, reached through hard links alone; None where there is none."""
@@ -182,47 +163,29 @@ class Hdf5File:
             found = found[name]
         return found
 
-    def _check_form(self, found: Any) -> None:
-        """Refuses a dataset whose values lie elsewhere, or whose type or filters are not plain."""
-        if found.dtype.kind not in NUMBERS or found.dtype.itemsize > 8 or found.dtype.subdtype:
-            raise ValueError(f"is of type {found.dtype}, not of numbers")
-        if found.shape is None or any(size < 0 for size in found.shape):
-            raise ValueError("has no shape")
-        if found.is_virtual or found.external:
-            raise ValueError("has its values in other files or datasets")
-        filters = _filters(found)
-        if set(filters) - FILTERS or len(set(filters)) < len(filters):
-            raise ValueError(f"has filters {filters}; only gzip, shuffle and fletcher32 are read")
-
     def _check_chunks(self, found: Any) -> None:
         """Refuses chunks that are larger than they say, or than the file justifies."""
         if found.chunks is None:
             return
+        properties = found.id.get_create_plist()
+        filters = [properties.get_filter(index)[0] for index in range(properties.get_nfilters())]
+        if set(filters) - FILTERS or len(set(filters)) < len(filters):
+            raise ValueError(f"has filters {filters}; only gzip, shuffle and fletcher32 are read")
         chunk_bytes = int(np.prod(found.chunks, dtype=object)) * found.dtype.itemsize
         if chunk_bytes > self._limit:
             raise ValueError(f"has chunks of {chunk_bytes} bytes, which the file's size does not justify")
-        filters = _filters(found)
-        packed_bit = 1 << filters.index(h5py.h5z.FILTER_DEFLATE) if h5py.h5z.FILTER_DEFLATE in filters else 0
-        size = os.fstat(self._raw).st_size
-        problems: list[str] = []
+        is_packed = h5py.h5z.FILTER_DEFLATE in filters
+        packed_bit = 1 << filters.index(h5py.h5z.FILTER_DEFLATE) if is_packed else 0
 
         def check(chunk: Any) -> None:
-            if problems or chunk.byte_offset is None:
-                return
-            if chunk.size > size:
-                problems.append("has a chunk that is larger than the file")
-            elif packed_bit and not chunk.filter_mask & packed_bit:
-                unpacker = zlib.decompressobj()
-                packed = os.pread(self._raw, chunk.size, chunk.byte_offset + self._file.userblock_size)
-                try:
-                    if len(unpacker.decompress(packed, chunk_bytes + 1)) > chunk_bytes:
-                        problems.append("has a chunk that unpacks to more than it should")
-                except zlib.error as error:
-                    problems.append(f"has a chunk that does not unpack ({error})")
+            if chunk.size > self._size:
+                raise ValueError("has a chunk that is larger than the file")
+            if packed_bit and not chunk.filter_mask & packed_bit:
+                _, packed = found.id.read_direct_chunk(chunk.chunk_offset)
+                if len(zlib.decompressobj().decompress(packed, chunk_bytes + 1)) > chunk_bytes:
+                    raise ValueError("has a chunk that unpacks to more than it should")
 
         found.id.chunk_iter(check)
-        if problems:
-            raise ValueError(problems[0])
 
     @contextlib.contextmanager
     def _named(self, member: str) -> Iterator[None]:
@@ -231,40 +194,8 @@ class Hdf5File:
             yield
         except StoreError:
             raise
-        except _ERRORS as error:
+        except (*_ERRORS, zlib.error) as error:
             reason = one_line(error) or type(error).__name__
             if not member:
                 raise StoreError(f"{self.path} does not open as HDF5 ({reason})") from None
             raise StoreError(f"{self.path}: {printable(member)[:200]} {reason}") from None
-
-
-class _CheckedFile(io.FileIO):
-    """A file as the library reads it, block by block; refuses a heap that cannot be walked to its end."""
-
-    def readinto(self, buffer: Any, /) -> int:
-        offset = self.tell()
-        count = super().readinto(buffer) or 0
-        if bytes(memoryview(buffer)[: len(HEAP)]) == HEAP:
-            self._check_heap(offset)
-        return count
-
-    def _check_heap(self, offset: int) -> None:
-        header = os.pread(self.fileno(), HEAP_HEADER, offset)
-        size = int.from_bytes(header[8:], "little")
-        if size > LARGEST_HEAP:
-            raise OSError(f"has a heap of {size} bytes, more than {LARGEST_HEAP}")
-        heap = os.pread(self.fileno(), size, offset)
-        place = HEAP_HEADER
-        while place + HEAP_ENTRY <= len(heap):
-            index = int.from_bytes(heap[place : place + 2], "little")
-            entry = int.from_bytes(heap[place + 8 : place + HEAP_ENTRY], "little")
-            entry = HEAP_ENTRY + -(-entry // 8) * 8 if index else entry
-            if entry < HEAP_ENTRY or place + entry > len(heap):
-                raise OSError(f"has a damaged heap: the entry {place} bytes behind its start does not fit")
-            place += entry
-
-
-def _filters(dataset: h5py.Dataset) -> list[int]:
-    """The filters of a dataset's chunks, in the order in which they were applied."""
-    properties = dataset.id.get_create_plist()
-    return [properties.get_filter(index)[0] for index in range(properties.get_nfilters())]

@@ -1,0 +1,441 @@
+"""The `.npy` files that the published code of FOCAL, IDAQ, CSRO and TCMRL writes and loads.
+
+`goal_idx3/trj_evalsample7_step5000.npy` is episode 7 of the stochastic policy of task 3 after 5,000 steps,
+`trj_eval7_step5000.npy` of the deterministic one. It is an object array of rows [observation, action, reward,
+next observation], which the loaders open by `numpy.load(path, allow_pickle=True)` and index as `rows[:, 0]`.
+They choose files by name (`data_dir`, `train_epoch` for the step, `n_trj` for the number of episodes) and
+take the last row of each for the end of an episode, so that flags, extra arrays and runs have no place.
+
+`tasks.json` beside the folders lists the tasks with their splits and parameters;
+`tcmrl-data import idaq-npy FOLDER --tasks FOLDER/tasks.json` reads them back. Episodes of the published data
+end with the time limit, so every last step is read as truncated, and the import says so.
+
+An object array is a pickle, which could run anything. It is read by the standard library's unpickler with an
+allow-list of the names that NumPy's arrays need. The names stand for classes of this module and not for
+NumPy's own functions: those take a forged type's word for what is a pointer, and crash or worse. The
+unpickler is the one in Python, since the one in C reserves as much memory as a pickle asks for.
+"""
+
+import os
+import pickle
+import re
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterator, Mapping
+from io import BytesIO
+from math import prod
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, final
+
+import numpy as np
+import numpy.typing as npt
+
+from tcmrl_data.dataset.selection import Selection
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.disk import disk, named_errors
+from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
+from tcmrl_data.interchange.exporting import REMEDY, Format, stored_episodes
+from tcmrl_data.interchange.reader import (
+    EpisodeCuts,
+    Reader,
+    ReaderOptions,
+    ReadPart,
+    Say,
+    decoded_limit,
+    episodes_of_rows,
+    require_file,
+)
+from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import task_line
+
+Policy = Literal["sample", "deterministic"]
+
+TASKS_FILE = "tasks.json"
+COLUMNS = 4
+
+LARGEST_FILE = 2**22
+"""Bytes of one episode's file; those that were published have at most a few hundred kilobytes."""
+
+MOST_OPERATIONS = 2**18
+"""Of a pickle; an episode of 500 steps takes 30,000. One of a single byte may take a hundred in memory."""
+
+NUMBER_TYPES = ("b1", "f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8")
+OBJECT_TYPE = "O8"
+
+_HEADER = re.compile(
+    rb"\x93NUMPY(?:\x01\x00..|\x02\x00....)"
+    rb"\{'descr': '\|O', 'fortran_order': False, 'shape': \((\d{1,9}), 4\), \} *\n",
+    re.DOTALL,
+)
+"""Version, length and text; a pattern, since NumPy's own reader takes the text for Python."""
+
+_TASK = re.compile(r"goal_idx([0-9]{1,9})")
+_EPISODE = re.compile(r"trj_eval(sample)?([0-9]{1,9})_step([0-9]{1,9})\.npy")
+
+
+@final
+class IdaqNpyFormat(Format):
+    """One folder per task, one file per episode; an episode without steps is a `StoreError`.
+
+    Episodes of several runs at the same snapshot step are numbered on.
+    """
+
+    name = "idaq-npy"
+
+    def place(self, selection: Selection, task: Task) -> str:
+        return f"goal_idx{task.index}"
+
+    def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
+        with named_errors(path, remedy=REMEDY):
+            disk.make_folder(path)
+        written: Counter[int] = Counter()
+        for key in selection.parts[task.index]:
+            for trajectory in stored_episodes(selection.dataset, key, format_name=self.name):
+                file = path / f"trj_evalsample{written[key.step]}_step{key.step}.npy"
+                with named_errors(file, remedy=REMEDY):
+                    disk.write(file, _pickled(trajectory))
+                written[key.step] += 1
+            yield key
+
+    def accompanying(self, selection: Selection) -> Mapping[str, bytes]:
+        lines = b",\n".join(task_line(task).strip() for task in selection.tasks)
+        return {TASKS_FILE: b"[\n" + lines + b"\n]\n"}
+
+
+def _pickled(trajectory: Trajectory) -> bytes:
+    """The content of an episode's file, which every Python 3 and every NumPy reads."""
+    rows = np.empty((len(trajectory), COLUMNS), dtype=object)
+    for step, row in enumerate(rows):
+        row[0], row[1] = trajectory.observations[step], trajectory.actions[step]
+        row[2], row[3] = float(trajectory.rewards[step]), trajectory.observations[step + 1]
+    header = BytesIO()
+    np.lib.format.write_array_header_1_0(header, {"descr": "|O", "fortran_order": False, "shape": rows.shape})
+    content = pickle.dumps(rows, protocol=3)
+    # NumPy 2 names a module that NumPy 1 lacks, on which the published code runs; both have the other one
+    return header.getvalue() + content.replace(b"cnumpy._core.multiarray\n", b"cnumpy.core.multiarray\n", 1)
+
+
+class IdaqNpyOptions(ReaderOptions):
+    """Options of the reader.
+
+    Attributes:
+        episodes: of the stochastic or of the deterministic policy; the stochastic one's where unset, or
+            the deterministic one's where a task has no others.
+    """
+
+    episodes: Policy | None = None
+
+
+class _File(NamedTuple):
+    """An episode's file, as its name tells."""
+
+    task: int
+    step: int
+    number: int
+    policy: Policy
+    path: Path
+
+
+@final
+class IdaqNpyReader(Reader):
+    """A path is the folder that holds `goal_idx0` and so on."""
+
+    name = "idaq-npy"
+    Options = IdaqNpyOptions
+    options: IdaqNpyOptions
+
+    def files(self, path: Path) -> list[Path]:
+        return [file.path for file in self._chosen(path, None)]
+
+    def read(self, path: Path, say: Say | None = None) -> Iterator[ReadPart]:
+        parts: dict[tuple[int, int], list[_File]] = defaultdict(list)
+        for file in self._chosen(path, say):
+            parts[file.task, file.step].append(file)
+        cuts = EpisodeCuts()
+        for (task, step), files in parts.items():
+            yield ReadPart(task, step, [episode for file in files for episode in _read(file.path, cuts)])
+        cuts.tell(say, path)
+
+    def _chosen(self, path: Path, say: Say | None) -> list[_File]:
+        """The files to read, sorted by task, step and episode."""
+        found = sorted(_list(path))
+        sampled = {file.task for file in found if file.policy == "sample"}
+        chosen = [
+            file
+            for file in found
+            if file.policy
+            == (self.options.episodes or ("sample" if file.task in sampled else "deterministic"))
+        ]
+        if not chosen:
+            raise StoreError(
+                f"{path}: holds no goal_idx0/trj_evalsample0_step0.npy ; name the folder of the tasks"
+            )
+        if say is not None and len(chosen) < len(found):
+            say(f"{path.name}: {len(found) - len(chosen):,} episodes of the other policy are left out")
+        return chosen
+
+
+def _list(path: Path) -> Iterator[_File]:
+    """All episodes' files below a path.
+
+    Raises:
+        StoreError: a folder cannot be listed, or an episode's file is no regular file.
+    """
+    for name in _names(path):
+        match = _TASK.fullmatch(name)
+        for episode in _names(path / name) if match is not None else ():
+            found = _EPISODE.fullmatch(episode)
+            if match is not None and found is not None:
+                file = path / name / episode
+                require_file(file)
+                policy: Policy = "sample" if found[1] else "deterministic"
+                yield _File(int(match[1]), int(found[3]), int(found[2]), policy, file)
+
+
+def _names(folder: Path) -> list[str]:
+    try:
+        return os.listdir(folder)
+    except OSError as error:
+        raise StoreError(f"{printable(str(folder))} cannot be read ({one_line(error)})") from None
+
+
+def _read(path: Path, cuts: EpisodeCuts) -> list[Trajectory]:
+    """The episode of a file; several where its rows do not follow each other."""
+    try:
+        data = read_plain_file(path, limit=LARGEST_FILE)
+        rows = _rows(data)
+        observations, actions, rewards, following = (
+            _column(rows[column::COLUMNS], column, len(data)) for column in range(COLUMNS)
+        )
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{path} {one_line(error)}") from None
+    return episodes_of_rows(
+        observations=observations,
+        actions=actions,
+        rewards=rewards,
+        terminals=np.zeros(len(rewards), dtype=bool),
+        timeouts=None,
+        next_observations=following,
+        cuts=cuts,
+        place=str(path),
+    )
+
+
+def _rows(data: bytes) -> list[Any]:
+    """The cells of all rows of a file, one row's behind another's.
+
+    Raises:
+        ValueError: it is no object array of rows; the message does not name the file.
+    """
+    match = _HEADER.match(data)
+    if match is None:
+        raise ValueError(f"is no object array of rows of {COLUMNS} cells [observation, action, reward, next]")
+    shape = (int(match[1]), COLUMNS)
+    array = unpickle_array(data[match.end() :])
+    if array.cells is None or array.shape != shape or not shape[0]:
+        raise PickleRefusedError(f"says shape {shape} and holds {array.shape}")
+    return array.cells
+
+
+def _column(cells: list[Any], column: int, file_bytes: int) -> npt.NDArray[Any]:
+    """A cell of all rows: numbers of (rows,), or arrays of (rows, width)."""
+    arrays = [_numbers(cell) for cell in cells]
+    if any(array.shape != arrays[0].shape or array.ndim > 1 for array in arrays):
+        raise ValueError(f"has cells of different shapes in column {column}")
+    if len(arrays) * max(arrays[0].nbytes, 8) > decoded_limit(file_bytes):
+        raise ValueError(f"has more values in column {column} than its size justifies")
+    return np.stack(arrays)
+
+
+def _numbers(cell: Any) -> npt.NDArray[Any]:
+    if isinstance(cell, PickledArray):
+        return cell.numbers()
+    if isinstance(cell, int | float):
+        return np.asarray(float(cell))
+    raise PickleRefusedError(f"has a cell that is {type(cell).__name__}, not a number")
+
+
+class PickleRefusedError(ValueError):
+    """A pickle that holds anything but arrays and numbers; the message does not name the file."""
+
+
+class _StandIn:
+    """What a name in a pickle stands for: it can be called and given a state, but no attribute is set."""
+
+    __slots__ = ()
+
+    def __setstate__(self, state: Any) -> None:
+        raise PickleRefusedError("holds a state of something else than an array")
+
+
+@final
+class _ArrayClass(_StandIn):
+    """`numpy.ndarray`, which arrays name and never call."""
+
+    __slots__ = ()
+
+    def __new__(cls, *arguments: Any) -> "_ArrayClass":
+        raise PickleRefusedError("makes something else than an array")
+
+
+@final
+class _Bytes(_StandIn):
+    """`_codecs.encode`, by which protocol 2 writes bytes."""
+
+    __slots__ = ()
+
+    def __new__(cls, text: Any, encoding: Any) -> Any:
+        if not isinstance(text, str) or encoding != "latin1":
+            raise PickleRefusedError("encodes something else than bytes")
+        return text.encode("latin1")
+
+
+@final
+class _Type(_StandIn):
+    """`numpy.dtype`: a number of fixed size, or objects."""
+
+    __slots__ = ("code", "order")
+
+    code: str
+    order: str
+
+    def __new__(cls, code: Any, *flags: Any) -> "_Type":
+        if code not in (OBJECT_TYPE, *NUMBER_TYPES):
+            raise PickleRefusedError(f"holds values of type {repr(code)[:40]}")
+        made = super().__new__(cls)
+        made.code, made.order = code, "<"
+        return made
+
+    def __setstate__(self, state: Any) -> None:
+        if not isinstance(state, tuple) or len(state) < 5 or state[1] not in ("<", ">", "|", "="):
+            raise PickleRefusedError("holds a type whose state is not NumPy's")
+        if any(member is not None for member in state[2:5]):
+            raise PickleRefusedError("holds a structured type")
+        self.order = ">" if state[1] == ">" else "<"
+
+    def values(self, data: Any, count: int) -> npt.NDArray[Any]:
+        """Numbers, as a view of their bytes."""
+        dtype = np.dtype(f"{self.order}{self.code}")
+        if not isinstance(data, bytes) or len(data) != count * dtype.itemsize:
+            raise PickleRefusedError(f"holds {count} values without their {count * dtype.itemsize} bytes")
+        return np.frombuffer(data, dtype)
+
+
+@final
+class _Scalar(_StandIn):
+    """`numpy.core.multiarray.scalar`, which makes a number."""
+
+    __slots__ = ()
+
+    def __new__(cls, kind: Any, data: Any) -> Any:
+        if not isinstance(kind, _Type) or kind.code == OBJECT_TYPE:
+            raise PickleRefusedError("holds a number without its type")
+        return float(kind.values(data, 1)[0])
+
+
+@final
+class PickledArray(_StandIn):
+    """`numpy.core.multiarray._reconstruct`: an array as a pickle has it.
+
+    Attributes:
+        shape: of the array.
+        cells: for objects, one for each element, in C order.
+    """
+
+    __slots__ = ("_values", "cells", "shape")
+
+    shape: tuple[int, ...]
+    cells: list[Any] | None
+    _values: npt.NDArray[Any] | None
+
+    def __new__(cls, kind: Any, shape: Any, code: Any) -> "PickledArray":
+        if kind is not _ArrayClass or shape != (0,):
+            raise PickleRefusedError("makes something else than an array")
+        made = super().__new__(cls)
+        made.shape, made.cells, made._values = (), None, None
+        return made
+
+    def __setstate__(self, state: Any) -> None:
+        if not isinstance(state, tuple) or len(state) != 5:
+            raise PickleRefusedError("holds an array whose state is not NumPy's")
+        _, shape, kind, is_fortran, data = state
+        if not isinstance(shape, tuple) or len(shape) > 2 or not isinstance(kind, _Type):
+            raise PickleRefusedError("holds an array without shape or type")
+        if not all(type(size) is int and size >= 0 for size in shape):
+            raise PickleRefusedError(f"holds an array of shape {repr(shape)[:80]}")
+        if is_fortran and len(shape) > 1:
+            raise PickleRefusedError("holds an array in Fortran order")
+        self.shape, self.cells, self._values = shape, None, None
+        if kind.code != OBJECT_TYPE:
+            self._values = kind.values(data, prod(shape)).reshape(shape)
+        elif isinstance(data, list) and len(data) == prod(shape):
+            self.cells = data
+        else:
+            raise PickleRefusedError(f"holds an object array of shape {shape} without its elements")
+
+    def numbers(self) -> npt.NDArray[Any]:
+        """The values, a view of the pickle's bytes.
+
+        Raises:
+            PickleRefusedError: the array holds objects, or has no state.
+        """
+        if self._values is None:
+            raise PickleRefusedError("holds objects where numbers should be")
+        return self._values
+
+
+_ALLOWED: dict[tuple[str, str], type[_StandIn]] = {
+    ("numpy", "ndarray"): _ArrayClass,
+    ("numpy", "dtype"): _Type,
+    ("_codecs", "encode"): _Bytes,
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): PickledArray for core in ("core", "_core")},
+    **{(f"numpy.{core}.multiarray", "scalar"): _Scalar for core in ("core", "_core")},
+}
+
+
+def _counted(operation: Callable[[Any], None]) -> Callable[[Any], None]:
+    def run(unpickler: Any) -> None:
+        unpickler.left -= 1
+        if unpickler.left < 0:
+            raise PickleRefusedError(f"has more than {MOST_OPERATIONS} operations")
+        operation(unpickler)
+
+    return run
+
+
+class _Unpickler(pickle._Unpickler):
+    dispatch = {  # noqa: RUF012
+        code: _counted(operation) for code, operation in pickle._Unpickler.dispatch.items()
+    }
+    left = MOST_OPERATIONS
+
+    def find_class(self, module: str, name: str) -> Any:
+        found = _ALLOWED.get((module, name))
+        if found is None:
+            place = printable(f"{module}.{name}")[:80]
+            raise PickleRefusedError(f"names {place}, which arrays do not need; it would run code")
+        return found
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise PickleRefusedError("refers to objects outside")
+
+
+def unpickle_array(data: bytes) -> PickledArray:
+    """The array of a pickle.
+
+    Raises:
+        PickleRefusedError: the pickle is damaged, or holds anything but arrays and numbers.
+    """
+    try:
+        found = _Unpickler(BytesIO(data)).load()
+    except PickleRefusedError:
+        raise
+    except (
+        *(EOFError, pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError),
+        *(OverflowError, MemoryError, RecursionError),
+    ) as error:
+        raise PickleRefusedError(f"is no whole pickle ({one_line(error) or type(error).__name__})") from None
+    if not isinstance(found, PickledArray):
+        raise PickleRefusedError(f"holds {type(found).__name__.strip('_')}, not an array")
+    return found

@@ -1,0 +1,306 @@
+"""Parquet, one file per task, `task_00000.parquet` and so on: one row a transition.
+
+| column | type | holds |
+|---|---|---|
+| task, step | int32 | index of the task, and the snapshot's training step |
+| run | text | of the part |
+| episode, time | int32 | number of the episode in the file, and of the row in it |
+| observation, next_observation | list of float32, of a fixed length | |
+| action | list of float32, of a fixed length | as executed, in [-1, 1] |
+| reward | float32 | |
+| terminated, truncated | bool | the task's end, and the time limit |
+| success … | as stored | further per-step arrays |
+
+The schema's metadata has under `tcmrl` a JSON object that names task, environment and dataset. Several files
+open as one table, since all have the columns in the same order.
+
+For reading, the columns `episode`, `observation`, `action`, `reward`, `next_observation`, `terminated` and
+`truncated` are needed; the rows of an episode stand behind one another. `step` is 0 without it. Further
+columns of numbers become per-step arrays. One file is one task.
+"""
+
+import contextlib
+import itertools
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, final
+
+import numpy as np
+import numpy.typing as npt
+
+from tcmrl_data.dataset.selection import Selection
+from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.foundation.disk import named_errors
+from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.plain_files import one_line
+from tcmrl_data.interchange.exporting import (
+    REMEDY,
+    Format,
+    require_room_for,
+    stored_episodes,
+    task_attributes,
+)
+from tcmrl_data.interchange.reader import (
+    EpisodeCuts,
+    FileTask,
+    Reader,
+    ReadPart,
+    Say,
+    decoded_limit,
+    described_task,
+    episode_of,
+    extras_of,
+    joined_observations,
+    last_flags,
+    parts_of_task,
+    require_file,
+)
+from tcmrl_data.store.keys import PartKey
+
+if TYPE_CHECKING:
+    import pyarrow
+
+LAYOUT, FORMAT_VERSION = "tcmrl-parquet", 1
+METADATA_KEY = "tcmrl"
+GROUP_ROWS = 2**16
+"""Rows of a row group, or up to a part more: what is in memory at a time."""
+
+INDEX_COLUMNS = ["task", "step", "run", "episode", "time"]
+SETTINGS = {"compression": "zstd", "use_dictionary": INDEX_COLUMNS, "write_statistics": INDEX_COLUMNS}
+
+NEEDED = ("episode", "observation", "action", "reward", "next_observation", "terminated", "truncated")
+STEP = "step"
+UNUSED = ("task", "run", "time")
+"""What the metadata and the order of rows say too, or a dataset has no place for."""
+
+BATCH_ROWS = 2**12
+ITEM_BYTES = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4}
+"""Bytes of a decoded value by its physical type; 8 for any other."""
+
+Rows = Mapping[str, npt.NDArray[Any]]
+"""Columns by name, of (rows,), or of (rows, width) where they hold lists."""
+
+_ERRORS = (OSError, RuntimeError, ValueError, TypeError, LookupError, OverflowError, MemoryError)
+"""What pyarrow raises for damaged files."""
+
+
+@final
+class ParquetFormat(Format):
+    """One file per task; an episode without steps is a `StoreError`."""
+
+    name = "parquet"
+    optional_packages = ("pyarrow",)
+    extra = "tcmrl[parquet]"
+
+    def place(self, selection: Selection, task: Task) -> str:
+        return f"task_{task.index:05d}.parquet"
+
+    def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
+        from pyarrow import concat_tables, parquet
+
+        attributes = task_attributes(selection, task, layout=LAYOUT, version=FORMAT_VERSION)
+        writer: parquet.ParquetWriter | None = None
+        waiting: list[pyarrow.Table] = []
+        episodes = 0
+        require_room_for(path)
+        with named_errors(path, remedy=REMEDY), contextlib.ExitStack() as stack:
+            file = stack.enter_context(path.open("xb"))
+            for key in selection.parts[task.index]:
+                trajectories = stored_episodes(selection.dataset, key, format_name="Parquet")
+                require_room_for(path, trajectories)
+                waiting.append(_table(trajectories, key, first=episodes))
+                episodes += len(trajectories)
+                if writer is None:
+                    schema = waiting[0].schema.with_metadata({METADATA_KEY: json.dumps(attributes)})
+                    writer = stack.enter_context(parquet.ParquetWriter(file, schema, **SETTINGS))
+                if sum(map(len, waiting)) >= GROUP_ROWS:
+                    writer.write_table(concat_tables(waiting))
+                    waiting = []
+                yield key
+            if writer is not None and waiting:
+                writer.write_table(concat_tables(waiting))
+
+
+def _table(trajectories: Sequence[Trajectory], key: PartKey, *, first: int) -> "pyarrow.Table":
+    """The rows of a part; `first` numbers its first episode."""
+    import pyarrow
+
+    lengths = [len(trajectory) for trajectory in trajectories]
+    rows = sum(lengths)
+    observations = [trajectory.observations for trajectory in trajectories]
+    columns = {
+        "task": pyarrow.array(np.full(rows, key.task, np.int32)),
+        "step": pyarrow.array(np.full(rows, key.step, np.int32)),
+        "run": pyarrow.array([key.run]).take(pyarrow.array(np.zeros(rows, np.int8))),
+        "episode": pyarrow.array(np.repeat(np.arange(first, first + len(lengths), dtype=np.int32), lengths)),
+        "time": pyarrow.array(np.concatenate([np.arange(length, dtype=np.int32) for length in lengths])),
+        "observation": _lists([rows[:-1] for rows in observations]),
+        "action": _lists([trajectory.actions for trajectory in trajectories]),
+        "reward": pyarrow.array(np.concatenate([trajectory.rewards for trajectory in trajectories])),
+        "next_observation": _lists([rows[1:] for rows in observations]),
+        "terminated": pyarrow.array(np.concatenate([trajectory.terminated for trajectory in trajectories])),
+        "truncated": pyarrow.array(np.concatenate([trajectory.truncated for trajectory in trajectories])),
+    }
+    for name in trajectories[0].extras:
+        columns[name] = pyarrow.array(
+            np.concatenate([trajectory.extras[name] for trajectory in trajectories])
+        )
+    fields = [pyarrow.field(name, column.type, nullable=False) for name, column in columns.items()]
+    return pyarrow.table(columns, schema=pyarrow.schema(fields))
+
+
+def _lists(arrays: Sequence[npt.NDArray[np.float32]]) -> "pyarrow.Array":
+    """Rows of equal width as lists."""
+    import pyarrow
+
+    rows = np.concatenate(arrays)
+    kind = pyarrow.list_(pyarrow.field("element", pyarrow.float32(), nullable=False), rows.shape[1])
+    return pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(rows.ravel()), type=kind)
+
+
+@final
+class ParquetReader(Reader):
+    """One file is one task."""
+
+    name = "parquet"
+    optional_packages = ("pyarrow",)
+    extra = "tcmrl[parquet]"
+
+    def files(self, path: Path) -> list[Path]:
+        return [require_file(path)]
+
+    def read(self, path: Path, say: Say | None = None) -> Iterator[ReadPart]:
+        from pyarrow import parquet
+
+        limit = decoded_limit(require_file(path).stat().st_size)
+        with _named(path, " does not open as Parquet"):
+            file = parquet.ParquetFile(path)
+        names = [field.name for field in file.schema_arrow if _holds_numbers(field.type)]
+        missing = [name for name in NEEDED if name not in names]
+        if missing:
+            raise StoreError(f"{path}: has no column {missing[0]} of numbers, which a row a transition has")
+        with _named(path, ": metadata tcmrl"):
+            text = ((file.schema_arrow.metadata or {}).get(METADATA_KEY.encode()) or b"").decode()
+        task, about = (
+            described_task(text, version=FORMAT_VERSION, place=str(path)) if text else (None, FileTask())
+        )
+        cuts = EpisodeCuts()
+        batches = _batches(file, [name for name in names if name not in UNUSED], limit, path)
+        episodes = (
+            (step, _episode(arrays, cuts, place=str(path))) for step, arrays in _by_episode(batches, path)
+        )
+        yield from parts_of_task(episodes, task, about, place=str(path))
+        cuts.tell(say, path)
+
+
+def _batches(file: Any, names: Sequence[str], limit: int, path: Path) -> Iterator[Rows]:
+    """The rows, some thousands at a time.
+
+    Raises:
+        StoreError: the values are more than the file's size justifies, or no table of numbers.
+    """
+    with _named(path):
+        groups = [file.metadata.row_group(index) for index in range(file.metadata.num_row_groups)]
+        chunks = [group.column(index) for group in groups for index in range(group.num_columns)]
+        used = [chunk for chunk in chunks if chunk.path_in_schema.partition(".")[0] in names]
+        if any(chunk.file_path for chunk in used):
+            raise ValueError("has columns in other files")
+        _check_size(sum(chunk.num_values * ITEM_BYTES.get(chunk.physical_type, 8) for chunk in used), limit)
+        decoded = 0
+        widths: dict[str, int] = {}
+        for batch in file.iter_batches(BATCH_ROWS, columns=list(names), use_threads=False):
+            made = {name: _numbers(batch.column(name), name, widths) for name in names}
+            decoded += sum(array.nbytes for array in made.values())
+            _check_size(decoded, limit)
+            yield made
+
+
+def _check_size(num_bytes: int, limit: int) -> None:
+    if num_bytes > limit:
+        raise ValueError(
+            "has more values than the file's size justifies; if you trust the file, write it again without "
+            "compression"
+        )
+
+
+@contextlib.contextmanager
+def _named(path: Path, what: str = "") -> Iterator[None]:
+    """Turns what damaged files cause into an error that names the file."""
+    try:
+        yield
+    except StoreError:
+        raise
+    except _ERRORS as error:
+        raise StoreError(f"{path}{what}: {one_line(error) or type(error).__name__}") from None
+
+
+def _holds_numbers(kind: Any) -> bool:
+    from pyarrow import types
+
+    is_list = types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
+    item = kind.value_type if is_list else kind
+    return bool(types.is_integer(item) or types.is_floating(item) or types.is_boolean(item))
+
+
+def _numbers(column: Any, name: str, widths: dict[str, int]) -> npt.NDArray[Any]:
+    """The values of a column, whose lists have the width that `widths` knows or, the first time, learns."""
+    from pyarrow import compute, types
+
+    is_list = not types.is_primitive(column.type)
+    values = column.flatten() if is_list else column
+    if column.null_count or values.null_count:
+        raise ValueError(f"{name} lacks values")
+    found = np.asarray(values.to_numpy(zero_copy_only=False))
+    if not is_list:
+        return found
+    lengths = compute.list_value_length(column).unique().to_pylist()
+    if len(lengths) != 1 or lengths[0] != widths.setdefault(name, lengths[0]):
+        raise ValueError(f"{name} has lists of different lengths")
+    return found.reshape(len(column), lengths[0])
+
+
+def _by_episode(batches: Iterable[Rows], path: Path) -> Iterator[tuple[int, Rows]]:
+    """The rows of every episode, with its snapshot's step."""
+    waiting: list[Rows] = []
+    before: tuple[int, int] | None = None
+    for batch in batches:
+        numbers = batch["episode"]
+        steps = batch.get(STEP, np.zeros(len(numbers), np.int64))
+        if {numbers.dtype.kind, steps.dtype.kind} - set("iu") or numbers.ndim != 1 or steps.ndim != 1:
+            raise StoreError(f"{path}: columns episode and step are no integers")
+        starts = np.flatnonzero((numbers[1:] != numbers[:-1]) | (steps[1:] != steps[:-1])) + 1
+        bounds = [0, *starts.tolist(), len(numbers)]
+        for start, stop in itertools.pairwise(bounds):
+            if start == stop:
+                continue
+            key = (int(steps[start]), int(numbers[start]))
+            if before is not None and key != before:
+                yield before[0], _joined(waiting)
+                waiting = []
+            before = key
+            waiting.append({name: array[start:stop] for name, array in batch.items()})
+    if before is not None:
+        yield before[0], _joined(waiting)
+
+
+def _joined(pieces: list[Rows]) -> Rows:
+    return {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+
+
+def _episode(rows: Rows, cuts: EpisodeCuts, *, place: str) -> Trajectory:
+    place = f"{place}: episode {int(rows['episode'][0])}"
+    for name in ("observation", "action", "next_observation"):
+        if rows[name].ndim != 2:
+            raise StoreError(f"{place}: column {name} has no lists")
+    further = {name: array for name, array in rows.items() if name not in (*NEEDED, STEP)}
+    return episode_of(
+        joined_observations(rows["observation"], rows["next_observation"], place=place),
+        rows["action"],
+        rows["reward"],
+        ended=last_flags(rows["terminated"], rows["truncated"], place),
+        extras=extras_of(further),
+        cuts=cuts,
+        place=place,
+    )

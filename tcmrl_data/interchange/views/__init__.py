@@ -1,1 +1,0 @@
-"""Selections as objects of other libraries, one library a file."""
