@@ -31,7 +31,7 @@ $(BIN)/python:
 
 $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
-	$(BIN)/python -m pip install --quiet -c constraints.txt --editable .
+	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[report]'
 	@touch $@
 
 $(INSTALLED_TEST): $(INSTALLED)

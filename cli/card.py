@@ -39,7 +39,7 @@ def cite(dataset: Path, form: str) -> None:
       tcmrl-data cite data/point-robot --format cff > CITATION.cff
     """
     import tcmrl_data
-    from tcmrl_data.card.citing import CitationFormat, citation_text
+    from tcmrl_data.describe.cite import CitationFormat, citation_text
 
     assert form in get_args(CitationFormat)
     manifest = tcmrl_data.open_dataset(dataset).manifest
@@ -55,7 +55,7 @@ def schema(kind: str) -> None:
     Example:
       tcmrl-data schema manifest > manifest.schema.json
     """
-    from tcmrl_data.card.schema import SchemaKind, json_schema
+    from tcmrl_data.describe.schema import SchemaKind, json_schema
 
     print_json(json_schema(cast(SchemaKind, kind)))
 
@@ -80,7 +80,7 @@ def croissant(dataset: Path, out: Path | None) -> None:
       tcmrl-data croissant data/point-robot
     """
     import tcmrl_data
-    from tcmrl_data.card.croissant import write_croissant
+    from tcmrl_data.describe.croissant import write_croissant
 
     opened = tcmrl_data.open_dataset(dataset)
     if out is None and opened.path != opened.folder:
@@ -110,7 +110,7 @@ def card(dataset: Path, out: Path | None, quiet: bool) -> None:
       tcmrl-data card data/point-robot --out data/point-robot/README.md
     """
     import tcmrl_data
-    from tcmrl_data.card.card import BEGIN, dataset_card, write_card
+    from tcmrl_data.describe.card import BEGIN, dataset_card, write_card
 
     opened = tcmrl_data.open_dataset(dataset)
     if out is None:

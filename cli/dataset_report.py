@@ -43,9 +43,6 @@ NOTHING_KEPT = "nothing was written; run the same command again"
     show_default=True,
     help="Number of episodes to simulate again and draw; MuJoCo needs OpenGL.",
 )
-@click.option(
-    "--pictures", is_flag=True, help="Draw pictures instead of figures with sliders: a smaller file."
-)
 @output_options
 def dataset_report(
     dataset: Path,
@@ -53,15 +50,14 @@ def dataset_report(
     episodes: int,
     transfer: bool,
     strips: int,
-    pictures: bool,
     as_json: bool,
     quiet: bool,
 ) -> None:
     """Write a page that shows what is in DATASET.
 
     The page is one HTML file that needs no network: verdicts, learning curves, returns, states that the tasks
-    visit, trajectories, actions, whole episodes, tasks and provenance. Its figures have sliders with
-    tcmrl[report] installed, and are pictures otherwise. It prints on paper.
+    visit, trajectories, actions, whole episodes, tasks and provenance. It prints on paper. Needs plotly:
+    pip install 'tcmrl[report]'.
 
     \b
     Examples:
@@ -81,7 +77,6 @@ def dataset_report(
             episodes=episodes,
             transfer=transfer,
             strips=strips,
-            is_interactive=not pictures,
             progress=lambda stage, done, total: progress.update(
                 stage, done=done, total=total, unit=UNITS[stage]
             ),

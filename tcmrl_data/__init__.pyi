@@ -19,6 +19,9 @@ from .dataset.returns import return_table as return_table
 from .dataset.selection import TIERS as TIERS
 from .dataset.selection import Selection as Selection
 from .dataset.view_file import is_view_file as is_view_file
+from .describe.render import Rendered as Rendered
+from .describe.render import render_episode as render_episode
+from .describe.report import report_dataset as report_dataset
 from .engine.base import ENGINES as ENGINES
 from .envs.base import ENVIRONMENTS as ENVIRONMENTS
 from .envs.base import Camera as Camera
@@ -87,9 +90,6 @@ from .recipe.recipe import load_recipe as load_recipe
 from .recipe.tasks import parse_indices as parse_indices
 from .recipe.values import list_environments as list_environments
 from .recipe.values import recipe_values as recipe_values
-from .rendering.render import Rendered as Rendered
-from .rendering.render import render_episode as render_episode
-from .report.report import report_dataset as report_dataset
 from .sampling.cache import CacheEntry as CacheEntry
 from .sampling.cache import cache_folder as cache_folder
 from .sampling.cache import cache_limit as cache_limit

@@ -10,7 +10,7 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import Dataset
-from tcmrl_data.card.card import BEGIN, END, dataset_card
+from tcmrl_data.describe.card import BEGIN, END, dataset_card
 from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.records import sealed
 from tcmrl_data.quality.scores import measure_quality
@@ -121,7 +121,7 @@ def test_a_stranger_cannot_break_out_of_the_card(tiny_copy: Copy) -> None:
 
     card = dataset_card(changed(tiny_copy(), change))
     assert front_matter(card)["license_name"] == "my: terms"
-    assert front_matter(card)["pretty_name"] == "---\nlicense: mit\n# x: |"
+    assert front_matter(card)["pretty_name"] == "--- license: mit # x: |"
     assert "<script>" not in card and card.count(END) == 1
     assert card.count("\n# ") == 1 and card.count("```") % 2 == 0
 

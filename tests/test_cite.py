@@ -8,8 +8,7 @@ import yaml
 from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, Manifest
-from tcmrl_data.card.citing import citation_text
-from tcmrl_data.card.yaml_text import scalar, yaml_text
+from tcmrl_data.describe.cite import citation_text
 from tcmrl_data.recipe.about import About, Reference, is_listed
 from tests.commands import in_process
 from tests.workers import ROOT
@@ -128,12 +127,3 @@ def test_the_softwares_own_cff_parses() -> None:
     document = yaml.safe_load((ROOT / "CITATION.cff").read_text(encoding="utf-8"))
     check_cff(document)
     assert (document["type"], document["license"]) == ("software", "MIT")
-
-
-@pytest.mark.parametrize(
-    "text", ["a: b", "# no", "- x", 'q"\\', "é \U0001f600", "\u2028￾\x7f\x85", "", "yes", "1"]
-)
-def test_texts_come_back_from_yaml(text: str) -> None:
-    assert yaml.safe_load(scalar(text)) == text
-    nested = {"a": [{"b": text, "c": [text, 1]}, text], "d": {"e": None, "f": [True, 1.5]}}
-    assert yaml.safe_load(yaml_text(nested)) == nested

@@ -1,8 +1,11 @@
 """`tcmrl-data report`: numbers as `inspect` prints them, texts of strangers, and what is refused."""
 
 import base64
-import importlib.util
+import dataclasses
+import html
 import json
+import re
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,33 +17,31 @@ from tcmrl_cli.data import data
 import tcmrl_data
 from tcmrl_data import Dataset
 from tcmrl_data.dataset.returns import episode_table
+from tcmrl_data.describe import measures
+from tcmrl_data.describe.measures import ACTION_BINS, SATURATED, Content, choose_plane, measure
+from tcmrl_data.describe.render import Strips, film_strips
+from tcmrl_data.describe.report import report_html
 from tcmrl_data.foundation.errors import RenderingError
-from tcmrl_data.page.markup import cell_text
+from tcmrl_data.page.page import cell_text
 from tcmrl_data.quality.worth import context_worth
-from tcmrl_data.report import content as contents
-from tcmrl_data.report.content import Content, measure
-from tcmrl_data.report.evenly import evenly
-from tcmrl_data.report.figures import learning_curves
-from tcmrl_data.report.measures import ACTION_BINS, SATURATED
-from tcmrl_data.report.plane import choose_plane
-from tcmrl_data.report.quality_figures import overlap, rewards, scores
-from tcmrl_data.report.report import compose, ignore, report_dataset
-from tcmrl_data.report.strips import Strips, film_strips
 from tcmrl_data.store.keys import PartKey
 from tests.commands import assert_refused, in_process
-from tests.test_page import documents
 
-HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>"
+pytest.importorskip("plotly", reason="plotly is not installed: pip install 'tcmrl[report]'")
+from tcmrl_data.describe import figures
+
+HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)> %{x}"
+CODES = {"f4": "<f4", "f8": "<f8", "i1": "i1", "i2": "<i2", "i4": "<i4", "u1": "u1", "u2": "<u2", "u4": "<u4"}
 
 
 @pytest.fixture(scope="module")
 def content(tiny: Dataset) -> Content:
-    return measure(tiny, browsed=4, progress=ignore)
+    return measure(tiny, browsed=4)
 
 
 @pytest.fixture(scope="module")
 def page(content: Content) -> str:
-    return compose(content).html()
+    return report_html(content)
 
 
 def all_arrays(dataset: Dataset) -> list[tuple[PartKey, dict[str, Any]]]:
@@ -49,14 +50,32 @@ def all_arrays(dataset: Dataset) -> list[tuple[PartKey, dict[str, Any]]]:
     ]
 
 
-@pytest.mark.skipif(importlib.util.find_spec("plotly") is None, reason="plotly is not installed")
+def frames_of(page: str, name: str) -> list[dict[str, Any]]:
+    """What the page's script draws in a figure, frame by frame."""
+    return document_of(page, name)["frames"]  # type: ignore[no-any-return]
+
+
+def document_of(page: str, name: str) -> dict[str, Any]:
+    _, figure = page.split(f'<figure class="interactive" id="{name}">')
+    found: dict[str, Any] = json.loads(
+        figure.split('<script type="application/json">', 1)[1].partition("</script>")[0]
+    )
+    return found
+
+
+def numbers(spec: dict[str, Any]) -> Any:
+    """An array as plotly.js reads it."""
+    array = np.frombuffer(base64.b64decode(spec["bdata"]), CODES[spec["dtype"]])
+    return array.reshape([int(size) for size in spec["shape"].split(",")]) if "shape" in spec else array
+
+
 def test_curves_are_the_numbers_of_inspect(page: str, tiny: Dataset) -> None:
-    traces = documents(page)[0]["frames"][0]["traces"]
+    (frame,) = frames_of(page, "learning-curves")
     drawn = {
         trace["hovertemplate"].split("<extra>")[1].removesuffix("</extra>"): [
-            np.frombuffer(base64.b64decode(trace[axis]["bdata"]), "<f8").tolist() for axis in ("x", "y")
+            numbers(trace[axis]).tolist() for axis in ("x", "y")
         ]
-        for trace in traces
+        for trace in frame["traces"]
         if "legendgroup" in trace
     }
     assert drawn == {
@@ -94,16 +113,29 @@ def test_measures_are_the_records_of_inspect(
         ("rewards", content.rewards),
     ):
         assert json.loads(call("inspect", name, tiny.folder, "--json")[1]) == record.model_dump(mode="json")
-    cells = [figure.frames[0].cells for figure in (scores(content), overlap(content))]
-    shown = {found.unit: found.z for found in cells if found is not None}
+    cells, overlap = (numbers(frames_of(page, name)[0]["traces"][0]["z"]) for name in ("scores", "overlap"))
     expected = [[snapshot.tq for snapshot in task.snapshots] for task in content.quality.tasks]
-    assert shown["TQ"] == pytest.approx(np.array(expected, np.float32))
-    assert shown["share of cells"] == pytest.approx(np.array(content.coverage.overlap.shares, np.float32))
-    last = rewards(content).frames[-1].series[0]
-    assert last.y.sum() == pytest.approx(1.0)
+    assert cells == pytest.approx(np.array(expected, np.float32))
+    assert overlap == pytest.approx(np.array(content.coverage.overlap.shares, np.float32))
     shares = np.array(content.coverage.overlap.shares)
     others = shares[~np.eye(len(shares), dtype=bool)].mean()
     assert f"Tasks share {others:.0%} of their states" in page
+
+
+def test_no_histogram_is_empty(page: str, content: Content) -> None:
+    """Every bar chart has the shares of all values, inside the axes that are drawn."""
+    for name, kind in (("returns", "bar"), ("rewards", "bar"), ("actions", "scatter")):
+        document = document_of(page, name)
+        low, high = document["layout"]["xaxis"]["range"]
+        assert len(document["frames"]) == len(content.summary["snapshots"])
+        for frame in document["frames"]:
+            assert frame["traces"], (name, frame["label"])
+            for trace in frame["traces"]:
+                x, y = numbers(trace["x"]), numbers(trace["y"])
+                assert trace["type"] == kind and len(x) == len(y) > 1
+                assert y.sum() == pytest.approx(1.0)
+                assert ((x >= low) & (x <= high)).all()
+                assert y.max() <= document["layout"]["yaxis"].get("range", [0.0, 1.0])[1]
 
 
 def test_visits_count_every_state_in_the_plane(content: Content, tiny: Dataset) -> None:
@@ -132,17 +164,17 @@ def test_actions_and_endings_are_those_of_the_episodes(content: Content, tiny: D
     assert np.abs(content.actions.counts[last] - expected).sum() <= 8
     assert content.actions.saturated_share(last) == (np.abs(own) >= SATURATED).mean()
     rows = [row for row in episode_table(tiny)["episodes"] if row["step"] == last]
-    found = content.episodes.found[last]
+    found = content.endings.by_step[last]
     assert (found.episodes, found.steps) == (len(rows), sum(row["length"] for row in rows))
     assert (found.terminated, found.truncated) == (0, len(rows))
-    returns = np.histogram([row["return"] for row in rows], content.episodes.edges)[0]
+    returns = np.histogram([row["return"] for row in rows], content.endings.edges)[0]
     assert found.returns.tolist() == returns.tolist()
 
 
 def test_browsed_episodes_are_the_stored_ones(content: Content, tiny: Dataset) -> None:
     assert len(content.browsed) == 4
     for found in content.browsed:
-        stored = tiny.trajectories(*found.key)[found.episode]
+        stored = tiny.trajectories(*found.key)[found.number]
         assert (found.rewards == stored.rewards).all()
         assert (found.observations == stored.observations[:-1]).all()
         assert (found.actions == stored.actions).all()
@@ -174,45 +206,59 @@ def test_without_named_columns_the_plane_keeps_most_variance(
 def test_of_many_tasks_some_are_drawn(
     content: Content, tiny: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(contents, "SHOWN_TASKS", 2)
-    few = measure(tiny, browsed=1, progress=ignore)
+    monkeypatch.setattr(measures, "SHOWN_TASKS", 2)
+    few = measure(tiny, browsed=1)
     assert [task.index for task in few.shown] == [0, 99]
     assert sorted(few.visits.counts) == [0, 99]
-    assert sum(found.episodes for found in few.episodes.found.values()) == tiny.manifest.totals.episodes
-    assert "2 evenly chosen tasks are shown, 3 others are not." in compose(few, is_interactive=False).html()
-    curves = learning_curves(few).frames[0].series
-    assert {line.label for line in curves if line.group} == {
-        f"task {task.index} ({task.split})" for task in few.shown
-    }
-    assert evenly([1, 2, 3], 9) == (1, 2, 3)
+    assert sum(found.episodes for found in few.endings.by_step.values()) == tiny.manifest.totals.episodes
+    text = report_html(few)
+    assert "2 evenly chosen tasks are shown, 3 others are not." in text
+    labels = [trace["hovertemplate"] for trace in frames_of(text, "learning-curves")[0]["traces"]]
+    for task in tiny.tasks:
+        is_shown = task.index in (0, 99)
+        assert any(f"task {task.index} (" in label for label in labels) == is_shown
 
 
 @pytest.mark.check
 def test_a_hostile_label_stays_text(tiny_copy: Callable[[], Path], tmp_path: Path) -> None:
     folder = tiny_copy()
-    tcmrl_data.rename_dataset(folder, HOSTILE)
-    for is_interactive in (True, False):
-        file = report_dataset(
-            tcmrl_data.open_dataset(folder), tmp_path / "a" / "report.html", is_interactive=is_interactive
-        )
-        text = file.read_text(encoding="utf-8")
-        assert "<img src=x" not in text
-        assert "<script>alert" not in text
-        assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    tcmrl_data.derive_dataset(folder, tmp_path / "half", tasks=[0])
+    tcmrl_data.merge_datasets([tmp_path / "half", folder], tmp_path / "merged", names=["half", "whole"])
+    tcmrl_data.rename_dataset(tmp_path / "merged", HOSTILE)
+    content = measure(tcmrl_data.open_dataset(tmp_path / "merged"), browsed=2)
+    named = dataclasses.replace(content, plane=dataclasses.replace(content.plane, names=(HOSTILE, HOSTILE)))
+    text = report_html(named)
+    assert "<img src=x" not in text
+    assert "<script>alert" not in text
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in text
+    # plotly.js reads tags in every text, and decodes these
+    titles = [document_of(text, "visits")["layout"][axis]["title"]["text"] for axis in ("xaxis", "yaxis")]
+    assert [html.unescape(title) for title in titles] == [HOSTILE, HOSTILE]
+    assert not re.search("[<>]", "".join(titles))
+
+
+def test_no_label_is_a_template_of_plotly(page: str) -> None:
+    trace = figures._line(np.arange(2), np.arange(2), HOSTILE)
+    label = trace.hovertemplate.split("<extra>")[1].removesuffix("</extra>")
+    assert "%{" not in label and "<" not in label and html.unescape(label) == html.unescape(trace.name)
 
 
 def test_the_command_writes_one_file(
-    tiny_copy: Callable[[], Path], capsys: pytest.CaptureFixture[str]
+    tiny_copy: Callable[[], Path], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     call, folder = in_process(data, capsys), tiny_copy()
-    code, output, errors = call("report", folder, "--json", "--pictures", "--episodes", 2)
+    code, output, errors = call("report", folder, "--json", "--episodes", 2)
     file = folder.with_name(f"{folder.name}-report.html")
     assert (code, json.loads(output)) == (0, {"report": str(file), "bytes": file.stat().st_size})
-    assert "pip install 'tcmrl[report]'" in file.read_text(encoding="utf-8").replace("&#x27;", "'")
+    file.unlink()
     code, output, errors = call("report", folder, "--out", file, "--quiet")
     assert (code, errors) == (0, "")
     assert output.startswith(f"{file}: written, ")
     assert file.stat().st_size < 6e6
+    file.unlink()
+    monkeypatch.setitem(sys.modules, "plotly.offline", None)
+    assert_refused(call("report", folder, "--out", file), "plotly", "pip install 'tcmrl[report]'")
+    assert not file.exists()
 
 
 def test_a_damaged_part_and_an_empty_dataset_are_refused(
@@ -228,11 +274,11 @@ def test_a_damaged_part_and_an_empty_dataset_are_refused(
 
 @pytest.mark.check
 def test_policies_in_other_tasks_and_pictures_are_shown_if_asked_for(tiny: Dataset, page: str) -> None:
-    found = measure(tiny, browsed=1, transfer=True, strips=2, progress=lambda stage, done, total: None)
+    found = measure(tiny, browsed=1, transfer=True, strips=2)
     assert found.transfer == tcmrl_data.measure_transfer(tiny)
     assert found.strips is not None
     assert [strip.content[:4] for strip in found.strips.drawn] == [b"\x89PNG"] * 2
-    text = compose(found, is_interactive=False).html()
+    text = report_html(found)
     assert 'id="cross-task-returns"' in text and text.count("Played again from its seed") == 4  # alt, caption
     _, splits = context_worth(found.transfer)
     assert f"A context is worth {'only ' if splits[-1].worth < 0.1 else ''}{splits[-1].worth:.0%}" in text
@@ -243,6 +289,6 @@ def test_an_environment_without_a_picture_is_said(tiny: Dataset, monkeypatch: py
     def refuse(*args: Any, **keywords: Any) -> None:
         raise RenderingError("it has no picture")
 
-    monkeypatch.setattr("tcmrl_data.report.strips.render_episode", refuse)
-    found = film_strips(tiny, tiny.tasks, 2, progress=lambda done, total: None)
+    monkeypatch.setattr("tcmrl_data.describe.render.render_episode", refuse)
+    found = film_strips(tiny, tiny.tasks)
     assert found == Strips((), "it has no picture")

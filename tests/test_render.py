@@ -16,12 +16,11 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import Dataset, FigureCamera, RenderingError, Trajectory, render_episode
+from tcmrl_data.describe.film import StoredEpisode, film, find_episode
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment
 from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.envs.simulation import SimulatedTask, find_open_gl
 from tcmrl_data.foundation.errors import SelectionError, SimulationError
-from tcmrl_data.rendering.filming import film
-from tcmrl_data.rendering.stored_episode import StoredEpisode, find_episode
 from tcmrl_data.store.keys import PartKey
 from tests.commands import Call, assert_refused, in_process
 from tests.environments import environment_of, episodes, parameters_of, some_members
@@ -70,7 +69,7 @@ def test_every_environment_gives_pictures_of_an_episode_that_comes_back(name: st
     if isinstance(task, SimulatedTask) and find_open_gl() is None:
         pytest.skip("no OpenGL works on this machine")
     task.close()
-    frames = film(environment, episode, frames=3, width=96, height=72)
+    frames = film(environment, episode, frames=3, width=96)
     steps = len(episode.trajectory)
     assert [frame.steps for frame in frames] == [0, round(steps / 2), steps]
     assert frames[-1].reward == pytest.approx(episode.trajectory.undiscounted_return)
@@ -85,16 +84,16 @@ def test_every_environment_gives_pictures_of_an_episode_that_comes_back(name: st
 )
 def test_an_episode_that_does_not_come_back_is_refused_with_its_first_step(name: str, step: int) -> None:
     environment, episode = stored_episode("point-robot")
-    film(environment, episode, frames=1, width=64, height=48)
+    film(environment, episode, frames=1, width=64)
     with pytest.raises(SimulationError, match=rf"{name.rstrip('s')} differs first at step {step}$"):
-        film(environment, changed(episode, name, step), frames=1, width=64, height=48)
+        film(environment, changed(episode, name, step), frames=1, width=64)
 
 
 def test_an_environment_without_a_camera_is_refused() -> None:
     environment, episode = stored_episode("point-robot")
     environment.camera = lambda *_, **__: None  # type: ignore[method-assign]
     with pytest.raises(RenderingError, match="'point-robot' has no picture; give its class a method"):
-        film(environment, episode, frames=1, width=64, height=48)
+        film(environment, episode, frames=1, width=64)
 
 
 def test_a_film_shows_every_step(call: Call, tiny: Dataset, tmp_path: Path) -> None:
@@ -191,7 +190,7 @@ def test_without_open_gl_a_line_says_what_to_install(chosen: str) -> None:
     episode = StoredEpisode(PartKey(0, 0), 0, {"velocity": 1.0}, trajectory, reset_seed=0)
     expected = "MUJOCO_GL=egl does not work" if chosen == "egl" else "no OpenGL works here"
     with pytest.raises(RenderingError, match=rf"{expected} .* install libegl1 .*, or libosmesa6"):
-        film(environment, episode, frames=1, width=64, height=48)
+        film(environment, episode, frames=1, width=64)
 
 
 @pytest.mark.check
@@ -200,7 +199,7 @@ def test_a_process_that_draws_ends_without_a_word(kind: str, tmp_path: Path) -> 
     script = (
         "from tests.test_render import *\n"
         "if find_open_gl() is None: sys.exit(3)\n"
-        "film(*stored_episode('half-cheetah-vel'), frames=2, width=64, height=48)\n"
+        "film(*stored_episode('half-cheetah-vel'), frames=2, width=64)\n"
     )
     environment = {"MUJOCO_GL": kind, "PATH": "/usr/bin:/bin", "PYTHONWARNINGS": "error::ResourceWarning"}
     root = Path(__file__).parents[1]
@@ -235,7 +234,7 @@ def test_derived_parts_start_again_from_the_seeds_of_their_sources(tmp_path: Pat
         environment.camera = lambda *_, width, height: Blank(width, height)  # type: ignore[method-assign]
         for key in dataset.parts:
             for number in range(len(dataset.trajectories(*key))):
-                film(environment, find_episode(dataset, key, number), frames=1, width=64, height=48)
+                film(environment, find_episode(dataset, key, number), frames=1, width=64)
                 filmed += 1
     assert filmed == 16 + 24 + 8 + 12
     with pytest.raises(SelectionError, match="4 episodes"):

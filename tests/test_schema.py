@@ -13,7 +13,7 @@ from tcmrl_cli.data import data
 import tcmrl_data
 from tcmrl_data import Dataset
 from tcmrl_data.building.events import BuildEvent, EventLog
-from tcmrl_data.card.schema import SchemaKind, json_schema, schema_file
+from tcmrl_data.describe.schema import SchemaKind, json_schema, schema_file
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part import RECORD
 from tests.commands import in_process

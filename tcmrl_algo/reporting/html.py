@@ -1,13 +1,15 @@
 """A report as one HTML file, with its figures in it: the paragraphs, tables and figures of the Markdown."""
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from tcmrl_algo.reporting.compose import Block, Page, Picture
+from markupsafe import Markup
+
+from tcmrl_algo.reporting.compose import Page, Picture
 from tcmrl_algo.reporting.tables import Table
-from tcmrl_data.page.markup import Markup, element, join, table
-from tcmrl_data.page.page import Page as HtmlPage
+from tcmrl_data.page.page import escaped, render_page
 
 _HEADING = re.compile(r"(#+) (.*)")
 _INLINE = re.compile(r"`([^`]+)`|\[([^\]]+)\]\(([^()\s]+)\)")
@@ -19,45 +21,46 @@ def page_html(page: Page) -> str:
     Raises:
         OSError: a figure was not drawn.
     """
-    title, *blocks = page.blocks
-    made = HtmlPage(str(title).lstrip("# "), is_interactive=False)
-    sections = 0
-    for block in blocks:
+    title = str(page.blocks[0]).lstrip("# ")
+    blocks = list(_blocks(page))
+    first = next((place for place, block in enumerate(blocks) if block["kind"] == "section"), len(blocks))
+    values = {"above": blocks[:first], "blocks": blocks[first:]}
+    return render_page("report.html.jinja", Path(__file__).parent, title=title, values=values)
+
+
+def _blocks(page: Page) -> Iterator[dict[str, Any]]:
+    """What the template shows below the title, with the kind of each block."""
+    for block in page.blocks[1:]:
         heading = _HEADING.fullmatch(block) if isinstance(block, str) else None
-        if heading is not None and heading[1] == "##":
-            sections += 1
-            made.section(f"section-{sections}", heading[2].replace("`", ""))
-        elif heading is not None:
-            made.add(element(f"h{len(heading[1])}", *_inline(heading[2])))
-        elif isinstance(block, Picture):
-            made.picture((page.out / block.file).read_bytes(), block.caption)
+        if isinstance(block, Picture):
+            yield {
+                "kind": "picture",
+                "content": (page.out / block.file).read_bytes(),
+                "caption": block.caption,
+            }
+        elif isinstance(block, Table):
+            cells = zip(*block.rows, strict=True) if block.rows else [()] * len(block.columns)
+            text = [
+                name
+                for name, column in zip(block.columns, cells, strict=True)
+                if any(isinstance(cell, str) for cell in column)
+            ]
+            yield {"kind": "table", "columns": block.columns, "rows": block.rows, "text": text}
+        elif heading is None:
+            yield {"kind": "text", "text": _inline(block)}
+        elif heading[1] == "##":
+            yield {"kind": "section", "heading": heading[2].replace("`", "")}
         else:
-            made.add(_block(block))
-    return made.html()
+            yield {"kind": f"h{len(heading[1])}", "text": _inline(heading[2])}
 
 
-def _block(block: Block) -> Markup:
-    if isinstance(block, Table):
-        text = [
-            column
-            for place, column in enumerate(block.columns)
-            if any(isinstance(row[place], str) for row in block.rows)
-        ]
-        return table(block.columns, block.rows, text=text)
-    assert isinstance(block, str)
-    return element("p", *_inline(block))
-
-
-def _inline(text: str) -> Iterable[str]:
+def _inline(text: str) -> Markup:
     """A paragraph's text, in which code and links to files beside the report become elements."""
-    place = 0
-    for match in _INLINE.finditer(text):
-        yield text[place : match.start()]
-        code, words, file = match.groups()
-        is_beside = file is not None and Path(file).name == file
-        if code is not None:
-            yield element("code", code)
-        else:
-            yield element("a", words, href=file) if is_beside else join([words])
-        place = match.end()
-    yield text[place:]
+    return Markup(_INLINE.sub(_element, escaped(text)))
+
+
+def _element(match: "re.Match[str]") -> str:
+    code, words, file = match.groups()
+    if code is not None:
+        return f"<code>{code}</code>"
+    return f'<a href="{file}">{words}</a>' if Path(file).name == file else words

@@ -1,1 +1,1 @@
-"""HTML pages in one file: escaped markup, figures, and the frame around them. Knows no dataset."""
+"""The frame of HTML pages in one file, as Jinja templates; it knows no dataset."""

@@ -6,12 +6,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tcmrl_data.page.markup import Markup, cell_text, element
+from tcmrl_data.describe.measures import Content
+from tcmrl_data.page.page import cell_text
 from tcmrl_data.quality.worth import context_worth
-from tcmrl_data.report.content import Content
 
 Tone = Literal["good", "note", "plain"]
-WORDS: dict[Tone, str] = {"good": "good", "note": "note", "plain": "fact"}
 
 SATURATION_NOTED = 0.5
 """Share of saturated action values from which a reader is warned."""
@@ -40,16 +39,10 @@ class Verdict:
     statement: str
     evidence: str
 
-    def markup(self) -> Markup:
-        """As an item of the list of verdicts."""
-        mark = element("span", WORDS[self.tone], kind="mark")
-        return element(
-            "li",
-            mark,
-            element("strong", self.statement),
-            element("p", self.evidence),
-            kind=f"verdict {self.tone}",
-        )
+    @property
+    def mark(self) -> str:
+        """The tone in a word."""
+        return "fact" if self.tone == "plain" else self.tone
 
 
 def judge(content: Content) -> list[Verdict]:
@@ -142,7 +135,7 @@ def _worth(content: Content) -> Verdict | None:
 
 
 def _endings(content: Content) -> Verdict:
-    found = content.episodes.found.values()
+    found = content.endings.by_step.values()
     episodes = sum(counts.episodes for counts in found)
     terminated = sum(counts.terminated for counts in found) / episodes
     truncated = sum(counts.truncated for counts in found) / episodes
@@ -155,7 +148,7 @@ def _endings(content: Content) -> Verdict:
 
 
 def _saturation(content: Content) -> Verdict:
-    share = {step: content.actions.saturated_share(step) for step in sorted(content.actions.values)}
+    share = {step: content.actions.saturated_share(step) for step in sorted(content.actions.counts)}
     last = list(share)[-1]
     evidence = (
         f"{share[last]:.0%} of the action values at step {last:,} have a size of at least 0.99 "

@@ -14,8 +14,8 @@ function numbers(spec) {
 
 // A heat map of counts: colors follow the logarithm, cells without visits stay blank.
 function colored(trace) {
-  const { isCount, ...rest } = trace;
-  if (!isCount) return rest;
+  const { meta, ...rest } = trace;
+  if (meta !== "counts") return rest;
   const counts = numbers(trace.z);
   const [rows, columns] = trace.z.shape.split(", ").map(Number);
   const z = [], text = [];

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.building.work_files import CROISSANT, CROISSANT_PARTS, CROISSANT_TASKS
-from tcmrl_data.card.citing import citation_of, citation_text
 from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.describe.cite import citation_of, citation_text
 from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.recipe.about import is_listed

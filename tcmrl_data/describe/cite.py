@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from typing import Any, Literal, get_args
 
-from tcmrl_data.card.yaml_text import yaml_text
+import yaml
+
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.recipe.about import AND, Reference, is_listed
 from tcmrl_data.recipe.recipe import load_recipe
@@ -180,7 +181,8 @@ def _cff(citation: Citation) -> str:
             },
         ],
     }
-    return yaml_text({name: value for name, value in fields.items() if value is not None})
+    known = {name: value for name, value in fields.items() if value is not None}
+    return str(yaml.safe_dump(known, sort_keys=False, allow_unicode=True))
 
 
 def _cff_reference(work: Reference) -> dict[str, Any]:

@@ -2,16 +2,17 @@
 
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
+from statistics import fmean
 from typing import Any
 
 import numpy as np
+import yaml
 
-from tcmrl_data.card.citing import citation_text
-from tcmrl_data.card.yaml_text import yaml_text
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.listing import dataset_summary
 from tcmrl_data.dataset.returns import return_table, summarize_returns
 from tcmrl_data.dataset.selection import TIERS
+from tcmrl_data.describe.cite import citation_text
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import StoreError, TcmrlError
 from tcmrl_data.foundation.machine import size
@@ -72,7 +73,7 @@ def dataset_card(dataset: Dataset, *, kept: str = "") -> str:
     """
     summary, quality = dataset_summary(dataset), measure_quality(dataset)
     sections = [
-        f"---\n{yaml_text(_front_matter(dataset, summary))}---",
+        f"---\n{yaml.safe_dump(_front_matter(dataset, summary), sort_keys=False, allow_unicode=True)}---",
         f"# {_plain(dataset.manifest.label or dataset.name)}",
         _plain(summary["description"]),
         "\n".join(filter(None, [BEGIN, kept, END])),
@@ -93,9 +94,9 @@ def _front_matter(dataset: Dataset, summary: dict[str, Any]) -> dict[str, Any]:
     known = [name for name in names if name in HUB_LICENCES]
     licence: dict[str, Any] = {"license": known if len(known) > 1 else known[0] if known else "other"}
     if len(known) < len(names):
-        licence = {"license": "other", "license_name": " AND ".join(manifest.licences)}
+        licence = {"license": "other", "license_name": _one_line(" AND ".join(manifest.licences))}
     return {
-        "pretty_name": manifest.label or manifest.name,
+        "pretty_name": _one_line(manifest.label or manifest.name),
         **licence,
         "task_categories": ["reinforcement-learning"],
         "tags": ["offline-reinforcement-learning", "meta-reinforcement-learning", "tcmrl", manifest.name],
@@ -181,17 +182,26 @@ def _returns(dataset: Dataset, quality: Quality) -> Iterator[str]:
 
 
 def _tiers(quality: Quality) -> Iterator[str]:
-    """Which share of the tasks has a tier, and the mean trajectory quality of its parts."""
-    rows = []
-    for tier in TIERS:
-        taken = [[part for part in task.snapshots if tier in part.tiers] for task in quality.tasks]
-        values = [part.tq for parts in taken for part in parts if part.tq is not None]
-        tasks, parts = sum(map(bool, taken)), sum(map(len, taken))
-        mean = _number(sum(values) / len(values) if len(values) == parts and values else None)
-        rows.append((f"`{tier}`", f"{tasks:,} of {len(taken):,}", f"{parts:,}", mean))
     yield "## Tiers"
     yield "Quality tiers by D4RL's words; `tcmrl-data derive DATASET --tier NAME --out FOLDER` makes one."
+    rows = [
+        (f"`{tier}`", f"{tasks:,} of {len(quality.tasks):,}", f"{parts:,}", _number(tq))
+        for tier, tasks, parts, _, tq in tier_rows(quality)
+    ]
     yield _table(["tier", "tasks", "parts", "mean TQ"], rows)
+
+
+def tier_rows(quality: Quality) -> Iterator[tuple[str, int, int, int, float | None]]:
+    """Of every tier: its name, the tasks that have it, their parts and episodes, and the parts' mean TQ.
+
+    The mean is None where the quality of a part is not known.
+    """
+    for tier in TIERS:
+        taken = [(task.task, part) for task in quality.tasks for part in task.snapshots if tier in part.tiers]
+        known = [part.tq for _, part in taken if part.tq is not None]
+        episodes = sum(part.episodes for _, part in taken)
+        mean = fmean(known) if known and len(known) == len(taken) else None
+        yield tier, len({task for task, _ in taken}), len(taken), episodes, mean
 
 
 def _how_to_use(dataset: Dataset) -> Iterator[str]:
@@ -271,10 +281,14 @@ def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def _plain(text: str) -> str:
     """A text of a stranger in one line of Markdown, without markup that it could end or begin."""
-    line = printable(" ".join(text.split()))
+    line = _one_line(text)
     for character in "\\`*_[]|":
         line = line.replace(character, f"\\{character}")
     return line.replace("&", "&amp;").replace("<", "&lt;").replace(">", "&gt;")
+
+
+def _one_line(text: str) -> str:
+    return printable(" ".join(text.split()))
 
 
 def _number(value: float | None) -> str:

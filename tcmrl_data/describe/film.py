@@ -1,19 +1,62 @@
 """Stored episodes played again: every step is compared with the stored one, and pictures are taken."""
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import final
+from typing import Any, final
 
 import numpy as np
 
+from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.base import Camera, Environment, EnvironmentLanes, Picture
 from tcmrl_data.envs.controller import Controller, PlaybackController, Transition, View
 from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.simulation import check_chosen_open_gl
-from tcmrl_data.envs.trajectory import FloatArray
-from tcmrl_data.foundation.errors import RenderingError, SimulationError
-from tcmrl_data.rendering.stored_episode import StoredEpisode
+from tcmrl_data.envs.trajectory import FloatArray, Trajectory
+from tcmrl_data.foundation.errors import RenderingError, SelectionError, SimulationError
+from tcmrl_data.foundation.seeding import Purpose, evenly_spread, keyed_seed
+from tcmrl_data.parts.making import operation_of
+from tcmrl_data.store.keys import PartKey
+
+
+@dataclass(frozen=True)
+class StoredEpisode:
+    """An episode, its place in its part, and the seed with which its task was reset."""
+
+    key: PartKey
+    number: int
+    parameters: Mapping[str, Any]
+    trajectory: Trajectory
+    reset_seed: int
+
+    def __str__(self) -> str:
+        return f"{self.key}, episode {self.number}"
+
+
+def find_episode(dataset: Dataset, key: PartKey, number: int) -> StoredEpisode:
+    """Reads an episode.
+
+    Raises:
+        SelectionError: the dataset has no such part, or the part no such episode.
+        RenderingError: the seed of its reset is not known.
+        StoreError: the part is damaged.
+    """
+    identity = dataset.part(*key).identity
+    if identity.seed is None:
+        raise RenderingError(
+            f"{dataset.path}: the seeds of the episodes of {key} are not known, so that they cannot be "
+            "played again; draw episodes of a dataset that was built, not imported or recorded"
+        )
+    trajectories = dataset.trajectories(*key)
+    if number >= len(trajectories):
+        raise SelectionError(
+            f"{dataset.path}: {key} has {len(trajectories)} episodes; choose --episode below that"
+        )
+    (run,) = (run for run in dataset.manifest.runs if run.name == key.run)
+    operation = operation_of(identity, str(dataset.file_of(key)))
+    task, position = operation.seeded_as(key.task, number, run)
+    seed = keyed_seed(identity.seed, dataset.name, task, Purpose.ROLLOUT_RESET, key.step, position)
+    return StoredEpisode(key, number, dataset.task(key.task).parameters, trajectories[number], seed)
 
 
 @dataclass(frozen=True)
@@ -37,17 +80,15 @@ def film(
     *,
     frames: int,
     width: int,
-    height: int,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> list[Frame]:
     """Plays an episode again and takes pictures, evenly spread from its start to its end.
 
     Args:
         environment: of its task.
-        episode: that is played.
+        episode: the episode.
         frames: most pictures.
-        width: of the pictures in pixels.
-        height: of the pictures in pixels.
+        width: of the pictures in pixels; their height is three quarters of it.
         progress: called with steps done and steps in all.
 
     Raises:
@@ -55,19 +96,19 @@ def film(
         SimulationError: a step differs from the stored one; names the first such step.
     """
     steps = len(episode.trajectory)
-    moments = np.linspace(0, steps, min(frames, steps + 1)).round().astype(int)
+    moments = evenly_spread(range(steps + 1), frames)
     if environment.simulator_bytes:
         check_chosen_open_gl()
     with contextlib.ExitStack() as stack:
         task = environment.make(episode.parameters, view="full")
         lanes = stack.enter_context(contextlib.closing(EnvironmentLanes(environment, [task])))
-        camera = environment.camera(task, episode.parameters, width=width, height=height)
+        camera = environment.camera(task, episode.parameters, width=width, height=3 * width // 4)
         if camera is None:
             raise RenderingError(
                 f"environment {environment.name!r} has no picture; give its class a method `camera`"
             )
         stack.callback(camera.close)
-        controller = _FilmingController(environment, episode, camera, set(moments.tolist()), progress)
+        controller = _FilmingController(environment, episode, camera, set(moments), progress)
         roll_out(
             environment,
             lanes,
@@ -90,7 +131,7 @@ class _FilmingController(Controller):
         episode: StoredEpisode,
         camera: Camera,
         moments: set[int],
-        progress: Callable[[int, int], None],
+        progress: Callable[[int, int], None] | None,
     ) -> None:
         self.frames: list[Frame] = []
         self._environment, self._episode, self._camera = environment, episode, camera
@@ -119,7 +160,8 @@ class _FilmingController(Controller):
         if not _equal(self._environment.stored_view(observation), stored.observations[step]):
             raise self._difference("observation", step)
         self._seen.append(observation.copy())
-        self._progress(step, len(stored))
+        if self._progress is not None:
+            self._progress(step, len(stored))
         if step in self._moments:
             reward = float(np.sum(stored.rewards[:step], dtype=np.float64))
             self.frames.append(Frame(self._camera.picture(np.stack(self._seen)), step, reward))

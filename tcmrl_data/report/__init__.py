@@ -1,1 +1,0 @@
-"""A dataset's report: a page that shows what is in it."""
