@@ -14,7 +14,7 @@ from tcmrl_data.parts.making import OWN_OPERATIONS
 from tcmrl_data.parts.operation import OPERATIONS
 from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
-from tcmrl_data.store.manifest import FOREIGN_KINDS, Run
+from tcmrl_data.store.manifest import FOREIGN_KINDS, Derivation, Manifest, Run
 
 
 def apply_operation(
@@ -97,14 +97,44 @@ def apply_operation(
     spec = DeriveSpec(
         dataset.path.resolve(), Path(out).resolve(), operation, common, recipe, source.seed, jobs
     )
-    with open_assembly(Path(out), derivation_of("apply", recorded, [dataset]), [dataset]) as assembly:
+    derivation = derivation_of("apply", recorded, [dataset])
+    make_of_parts(
+        dataset, Path(out), spec, derivation, runs=[made], label=label, workers=workers, progress=progress
+    )
+    return open_dataset(out)
+
+
+def make_of_parts(
+    dataset: Dataset,
+    out: Path,
+    spec: DeriveSpec,
+    derivation: Derivation,
+    *,
+    runs: Sequence[Run],
+    label: str | None,
+    workers: int | None,
+    progress: Callable[[int, int], None] | None,
+) -> Manifest:
+    """Makes a dataset of the parts that an operation makes of another's, and of nothing else.
+
+    Args:
+        dataset: whose parts are read.
+        out: folder of the new dataset.
+        spec: the parts to make.
+        derivation: what is made; the same one goes on after a stop.
+        runs: of the new parts.
+        label: the new dataset's own name.
+        workers: processes at the same time; one per core where None.
+        progress: called with parts done and parts in all.
+    """
+    tasks = {job.key.task for job in spec.jobs}
+    with open_assembly(out, derivation, [dataset]) as assembly:
         for published in derive_parts(spec, workers=workers, progress=progress):
             assembly.take(published)
-        assembly.finish(
+        return assembly.finish(
             name=dataset.name,
             data_version=dataset.manifest.data_version,
-            runs=[made],
-            tasks=[task for task in dataset.tasks if task.index in chosen],
+            runs=runs,
+            tasks=[task for task in dataset.tasks if task.index in tasks],
             label=label,
         )
-    return open_dataset(out)

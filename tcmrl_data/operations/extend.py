@@ -13,6 +13,7 @@ from tcmrl_data.foundation.errors import BuildError, StoreError
 from tcmrl_data.operations.assembly import Copied, append_parts, derivation_of, open_assembly
 from tcmrl_data.operations.planning import (
     check_parts,
+    jobs_of_pairs,
     keys_of_run,
     nearest_pairs,
     runs_of_pairs,
@@ -168,13 +169,7 @@ class _Extension:
         if cross:
             tasks = self._dataset.tasks
             pairs = nearest_pairs(tasks, [task for task in tasks if task.index in {*sources}], cross)
-        runs = runs_of_pairs(pairs, name)
-        return [
-            Job(key, PartKey(target, key.step, runs[source, target]))
-            for source, target in pairs
-            for key in keys
-            if key.task == source
-        ]
+        return jobs_of_pairs(runs_of_pairs(pairs, name), keys)
 
     def runs(self, jobs: Sequence[Job]) -> list[Run]:
         """The runs of the dataset with the new ones.

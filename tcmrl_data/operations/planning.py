@@ -13,6 +13,7 @@ from tcmrl_data.foundation.errors import BuildError, NondeterminismError, Select
 from tcmrl_data.operations.assembly import Copied, open_assembly
 from tcmrl_data.parts.making import make_from, operation_of_run
 from tcmrl_data.parts.operation import Operation, StoredPart, can_be_made_again
+from tcmrl_data.parts.worker import Job
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import Derivation, Manifest, Run
@@ -266,6 +267,16 @@ def runs_of_pairs(pairs: Iterable[Pair], run: str) -> dict[Pair, str]:
         counts[target] = counts.get(target, 0) + 1
         runs[source, target] = run if counts[target] == 1 else f"{run}-{counts[target]}"
     return runs
+
+
+def jobs_of_pairs(runs: Mapping[Pair, str], keys: Sequence[PartKey]) -> list[Job]:
+    """The parts that are made of the keys of the pairs' first tasks, in the runs of the pairs."""
+    return [
+        Job(key, PartKey(target, key.step, run))
+        for (source, target), run in runs.items()
+        for key in keys
+        if key.task == source
+    ]
 
 
 def _scaled(tasks: Sequence[Task]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -9,10 +9,12 @@ from pathlib import Path
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.errors import BuildError, SelectionError
-from tcmrl_data.operations.assembly import check_out, derivation_of, open_assembly
+from tcmrl_data.operations.apply import make_of_parts
+from tcmrl_data.operations.assembly import check_out, derivation_of
 from tcmrl_data.operations.planning import (
     Pair,
     check_parts,
+    jobs_of_pairs,
     keys_of_run,
     nearest_pairs,
     runs_of_pairs,
@@ -21,8 +23,8 @@ from tcmrl_data.operations.planning import (
 from tcmrl_data.parts.making import wanted_from
 from tcmrl_data.parts.operation import Simulator, Sources, StoredPart
 from tcmrl_data.parts.playback import RELABEL, first_episode_of
-from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
-from tcmrl_data.store.keys import MAIN_RUN, MAX_RUNS, PartKey
+from tcmrl_data.parts.worker import DeriveSpec
+from tcmrl_data.store.keys import MAIN_RUN, MAX_RUNS
 from tcmrl_data.store.manifest import Run
 
 
@@ -103,12 +105,7 @@ def relabel_dataset(
     pairs = _pairs(dataset, sources, to, allow_test)
     keys = keys_of_run(dataset, of, [task.index for task in sources], snapshots)
     names = runs_of_pairs(pairs, run)
-    jobs = [
-        Job(key, PartKey(target, key.step, names[source, target]))
-        for source, target in pairs
-        for key in keys
-        if key.task == source
-    ]
+    jobs = jobs_of_pairs(names, keys)
     check_parts(dataset, source_run, sorted({job.source for job in jobs}), policy=False)
     runs = [
         Run(
@@ -136,32 +133,16 @@ def relabel_dataset(
     }
     derivation = derivation_of(RELABEL, settings, [dataset])
     check_out(out, derivation)
-    first_episode = first_episode_of(source_run)
-    spec = DeriveSpec(
-        dataset.path.resolve(),
-        out.resolve(),
-        RELABEL,
-        {"first_episode": first_episode},
-        recipe,
-        seed,
-        tuple(jobs),
-    )
+    common = {"first_episode": first_episode_of(source_run)}
+    spec = DeriveSpec(dataset.path.resolve(), out.resolve(), RELABEL, common, recipe, seed, tuple(jobs))
     _try_out(dataset, spec)
     steps = sum(dataset.entry(job.source).steps for job in jobs)
     counts = (tuple(found.name for found in runs), len(pairs), len(jobs), steps)
     if dry_run:
         return RelabelReport(out, *counts, None)
-    targets = {job.key.task for job in jobs}
-    with open_assembly(out, derivation, [dataset]) as assembly:
-        for published in derive_parts(spec, workers=workers, progress=progress):
-            assembly.take(published)
-        manifest = assembly.finish(
-            name=dataset.name,
-            data_version=dataset.manifest.data_version,
-            runs=runs,
-            tasks=[task for task in dataset.tasks if task.index in targets],
-            label=label,
-        )
+    manifest = make_of_parts(
+        dataset, out, spec, derivation, runs=runs, label=label, workers=workers, progress=progress
+    )
     return RelabelReport(out, *counts, manifest.root)
 
 
