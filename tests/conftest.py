@@ -16,8 +16,7 @@ from hypothesis import HealthCheck, settings
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe
-from tcmrl_data.engine.in_process import InProcessEngine
-from tcmrl_data.engine.local import LocalEngine
+from tcmrl_data.engine.local import InProcessEngine, LocalEngine
 from tests.namespace import has_only_loopback
 from tests.workers import MARK, ROOT
 

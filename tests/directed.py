@@ -19,7 +19,7 @@ from tcmrl_data.engine.base import Unit
 from tcmrl_data.foundation import disk
 from tests.workers import wait_for
 
-BUILD, EXPERIMENT = "tcmrl_data.building.driver", "tcmrl_algo.experiment.runner"
+BUILD, EXPERIMENT = "tcmrl_data.building.build", "tcmrl_algo.experiment.runner"
 """The modules that make units."""
 
 WORKERS = {BUILD: "tcmrl_data.building.worker", EXPERIMENT: "tcmrl_algo.experiment.job"}

@@ -9,7 +9,7 @@ from tcmrl_algo.experiment.config import read_experiment, run_id
 from tcmrl_algo.experiment.results import CurvePoint, RunResult
 from tcmrl_algo.experiment.runner import EndedRun
 from tcmrl_data import load_recipe
-from tcmrl_data.engine.in_process import InProcessEngine
+from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.records import write_record
 
 SMALL = {

@@ -21,7 +21,7 @@ from tcmrl_data import (
     open_dataset,
     roll_out,
 )
-from tcmrl_data.building.driver import Driver
+from tcmrl_data.building.build import Driver
 from tcmrl_data.building.events import BuildEvent, EventLog
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.plan import plan_build

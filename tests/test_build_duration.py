@@ -5,8 +5,8 @@ import itertools
 import pytest
 
 import tcmrl_data
-from tcmrl_data.building import probe
-from tcmrl_data.building.duration import Measurement, makespan, task_seconds
+from tcmrl_data.building import forecast
+from tcmrl_data.building.forecast import Measurement, makespan, task_seconds
 from tests.conftest import TINY
 
 
@@ -27,11 +27,11 @@ def test_a_probe_shortens_the_warm_up_and_nothing_else(name: str) -> None:
 def test_the_probes_clock_parts_warm_up_from_updates(monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps of 0.01 s until 200 are done, a report while libraries initialise, then 1 s and 3 s."""
     now = itertools.accumulate([0.0] + [0.2] * 10 + [500.0, 20.0, 60.0])
-    monkeypatch.setattr(probe.time, "monotonic", lambda: next(now))
-    clock = probe.Clock(200)
+    monkeypatch.setattr(forecast.time, "monotonic", lambda: next(now))
+    clock = forecast.Clock(200)
     for _ in range(12):
         clock.report(20)
-    with pytest.raises(probe.ProbeOverError):
+    with pytest.raises(forecast.ProbeOverError):
         clock.report(20)
     found = clock.measured()
     assert found["warmup"] == pytest.approx(0.01)

@@ -70,7 +70,7 @@ def test_every_table_fits_a_terminal_and_says_what_it_says_in_a_pipe(
     in_process: None,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("tcmrl_data.building.probe.UPDATE_SECONDS", 0.1)  # of what `plan` measures
+    monkeypatch.setattr("tcmrl_data.building.forecast.UPDATE_SECONDS", 0.1)  # of what `plan` measures
     arguments = [str(tiny_folder) if word == "DATASET" else word for word in command]
     shown = as_in_terminal(data, *arguments)
     assert shown.code == 0

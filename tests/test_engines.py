@@ -17,11 +17,11 @@ import torch
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
-from tcmrl_data.building.driver import WORKER
+from tcmrl_data.building.build import WORKER
 from tcmrl_data.building.unit import UnitSpec
-from tcmrl_data.engine import _attempt
+from tcmrl_data.engine import local
 from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit, longest_first
-from tcmrl_data.engine.in_process import InProcessEngine
+from tcmrl_data.engine.local import InProcessEngine, LocalEngine
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import BuildError
@@ -337,14 +337,14 @@ def test_a_worker_that_ends_before_it_has_read_its_spec_is_a_crash(
     program: str, error: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The spec is written after the worker has ended, so the pipe is already closed."""
-    start = _attempt._start_worker
+    start = local._start_worker
 
     def start_and_outlive(unit: Unit, errors: IO[str]) -> "subprocess.Popen[str]":
         worker = start(unit, errors)
         worker.wait()
         return worker
 
-    monkeypatch.setattr(_attempt, "_start_worker", start_and_outlive)
+    monkeypatch.setattr(local, "_start_worker", start_and_outlive)
     monkeypatch.setattr(sys, "executable", program)
     (result,) = run(EngineCase("local", None, ""), [Unit("task 3", {}, WORKER)]).values()
     assert (result.ok, result.attempt) == (False, 2)
@@ -356,13 +356,12 @@ def test_parts_whose_messages_are_lost_are_taken_in_all_the_same(
     tiny_recipe: Recipe, tiny_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A worker can be killed between publishing a part and reporting it."""
-    local = ENGINES.get("local")
-    run_and_tell = local.run
+    run_and_tell = LocalEngine.run
 
     def run_silently(self: BaseEngine, units: list[Unit], on_message: Message) -> Iterator[Result]:
         yield from run_and_tell(self, units, lambda unit, message: None)
 
-    monkeypatch.setattr(local, "run", run_silently)
+    monkeypatch.setattr(LocalEngine, "run", run_silently)
     report = tcmrl_data.build_dataset(tiny_recipe, tmp_path / "data", tasks=[3], workers=1)
     assert (report.built, ids(tmp_path / "data")) == (3, ids(tiny_folder, 3))
 

@@ -14,8 +14,7 @@ from tcmrl_cli.data import data
 
 from tcmrl_data import build_status, collect_garbage
 from tcmrl_data.building import events
-from tcmrl_data.building.events import EARLIER_EVENTS, EVENTS, BuildEvent, EventLog
-from tcmrl_data.building.history import MAX_FAILURES
+from tcmrl_data.building.events import EARLIER_EVENTS, EVENTS, MAX_FAILURES, BuildEvent, EventLog
 from tcmrl_data.foundation.disk import LOCK, lock_file
 from tcmrl_data.store.manifest import MANIFEST
 from tests.commands import run

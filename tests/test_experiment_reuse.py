@@ -13,7 +13,7 @@ from tcmrl_algo.experiment.config import Experiment, read_experiment
 from tcmrl_algo.experiment.planning import PlannedRun, plan_runs
 from tcmrl_algo.tuning.record import RECORD, Trial, Tuning
 from tcmrl_data import CheckpointError, TrainingError
-from tcmrl_data.engine.in_process import InProcessEngine
+from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.records import write_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process

@@ -14,9 +14,8 @@ from tcmrl_data import Recipe
 from tcmrl_data.building import nodes
 from tcmrl_data.building.nodes import check_nodes
 from tcmrl_data.building.plan import BuildPlan, plan_build
-from tcmrl_data.engine._attempt import run_attempt
 from tcmrl_data.engine.base import BaseEngine, Message, NodeReport, Result, Unit
-from tcmrl_data.engine.local import LocalEngine
+from tcmrl_data.engine.local import LocalEngine, run_attempt
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import BuildError
 from tests.workers import ROOT, other_version
@@ -34,6 +33,7 @@ class Machine:
 class Machines(BaseEngine):
     """Every machine is this one, with other variables or without the shared folder."""
 
+    takes_address = True
     machines: tuple[Machine, ...] = ()
 
     def run(self, units: Sequence[Unit], on_message: Message) -> Generator[Result, None, None]:

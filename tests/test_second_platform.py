@@ -15,7 +15,7 @@ from tcmrl_data import BuildEvent, load_recipe, open_dataset, verify_dataset
 from tcmrl_data.behavior.checkpoints import CheckpointFolder
 from tcmrl_data.building import unit
 from tcmrl_data.building.events import EVENTS
-from tcmrl_data.engine.in_process import InProcessEngine
+from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK
 from tcmrl_data.store.keys import PartKey, part_file
 from tests.conftest import TASKS, TINY

@@ -29,7 +29,7 @@ from tcmrl_algo.tuning.proposals import GENERATION, RANDOM_TRIALS, known_to, pro
 from tcmrl_algo.tuning.record import Trial
 from tcmrl_algo.tuning.space import Dimension, space_on
 from tcmrl_data import Dataset, SelectionError, TrainingError
-from tcmrl_data.engine.in_process import InProcessEngine
+from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.errors import CheckpointError, MissingPackageError
 from tcmrl_data.store.part import References
 from tests.commands import Call, assert_refused, in_process

@@ -1,23 +1,30 @@
 """Building a dataset: choose tasks, refuse what cannot work, run units on an engine, keep what is done."""
 
+import contextlib
+import dataclasses
 import shutil
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from tcmrl_data.building.driver import Driver
-from tcmrl_data.building.events import BuildEvent, EventLog
+from tcmrl_data.building.events import BuildEvent, EventKind, EventLog
 from tcmrl_data.building.ledger import Ledger
+from tcmrl_data.building.nodes import check_nodes
 from tcmrl_data.building.plan import plan_build
+from tcmrl_data.building.unit import UnitSpec
 from tcmrl_data.building.work_files import ASSEMBLY, WORK_FILES, WORK_FOLDERS, check_work_files
-from tcmrl_data.engine.base import BaseEngine, make_engine
+from tcmrl_data.engine.base import BaseEngine, Result, Unit, make_engine
+from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import differences
 from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
+from tcmrl_data.foundation.locks import VISIBLE_SECONDS
 from tcmrl_data.foundation.machine import size
+from tcmrl_data.parts.making import Published
 from tcmrl_data.recipe.recipe import Recipe, full_settings
-from tcmrl_data.store.keys import PARTS
+from tcmrl_data.store.keys import PARTS, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part import DATA_VERSION
 from tcmrl_data.store.part_table import PARTS_TABLE
@@ -153,3 +160,143 @@ def _check_space(out: Path, needed: int, num_parts: int) -> None:
             f"{out}: {num_parts} parts take up to {size(needed)}, {size(free)} are free; "
             "make room or build fewer --tasks at a time"
         )
+
+
+WORKER = "tcmrl_data.building.worker"
+"""Module that does a unit."""
+
+
+class Driver:
+    """Runs the units that have missing parts.
+
+    Args:
+        ledger: of the dataset; the driver is its only writer.
+        dataset: the dataset's folder, as workers find it.
+    """
+
+    def __init__(self, ledger: Ledger, dataset: Path) -> None:
+        self._ledger, self._plan, self._dataset = ledger, ledger.plan, dataset
+        self._steps_done = self._steps_total = 0
+        self._deadline = 0.0
+
+    def run(self, engine: BaseEngine, log: EventLog) -> tuple[str, ...]:
+        """Runs the units; returns one line per failure.
+
+        However the units end, the manifest then names every part that was taken in.
+        """
+        ledger = self._ledger
+        groups = [group for group in self._plan.groups if self._missing(group)]
+        tasks_of = {_unit_id(group): group for group in groups}
+        self._steps_total = self._plan.source.training_steps * sum(map(len, groups))
+        failures: list[str] = []
+        remarks = [*check_nodes(engine, self._plan, self._dataset), *self._remarks()]
+        self._deadline = VISIBLE_SECONDS if engine.takes_address else 0.0
+        ledger.begin()
+        try:
+            unfinished = len(self._plan.wanted) - ledger.num_tasks_done
+            log.write(self._event("start", f"{unfinished} of {len(self._plan.wanted)} tasks to build"))
+            for remark in remarks:
+                log.write(self._event("warning", remark))
+            results = engine.run(
+                [self._unit(group) for group in groups],
+                lambda unit, message: self._on_message(unit, message, log),
+            )
+            with contextlib.closing(results):
+                for result in results:
+                    result = self._checked(result, tasks_of[result.id])
+                    if result.ok:
+                        log.write(self._event("unit_done", f"{result.id} done", result.id))
+                    else:
+                        failures.append(_failure(result))
+                        log.write(self._event("unit_failed", failures[-1], result.id))
+        except KeyboardInterrupt:
+            for group in groups:
+                self._take_in_unreported(group)
+            raise
+        finally:
+            ledger.seal()
+            log.write(self._event("end", f"{ledger.num_parts} parts, {len(failures)} units failed"))
+        return tuple(sorted(failures))
+
+    def _remarks(self) -> list[str]:
+        """What a user should know before the units start."""
+        damaged = [
+            f"{file} was damaged before it was recorded; it is made again" for file in self._ledger.damaged
+        ]
+        here, earlier = self._plan.platform, self._ledger.platforms
+        if not earlier or here.digest() in {platform.digest() for platform in earlier}:
+            return damaged
+        differences = "; ".join(here.differences(earlier[-1]))
+        return [
+            *damaged,
+            f"parts were made on another platform ({differences}); missing parts are made on this one, and "
+            "nothing is compared across the two",
+        ]
+
+    def _unit(self, tasks: tuple[Task, ...]) -> Unit:
+        """The unit of a group; done and dropped tasks stay in it, since their absence may change rounding."""
+        plan = self._plan
+        spec = UnitSpec(self._dataset, plan.recipe, plan.seed, tasks, plan.dropped)
+        reserved = plan.recipe.build
+        return Unit(
+            _unit_id(tasks),
+            spec.to_json(),
+            WORKER,
+            cost=plan.source.training_steps * len(tasks),
+            cpus=reserved.cpus,
+            gpus=reserved.gpus,
+            memory=max(reserved.memory, plan.unit_bytes(len(tasks))),
+            timeout=reserved.timeout,
+        )
+
+    def _missing(self, tasks: Sequence[Task]) -> list[PartKey]:
+        """The missing parts of a group."""
+        return [key for task in tasks for key in self._ledger.missing(task.index)]
+
+    def _checked(self, result: Result, tasks: Sequence[Task]) -> Result:
+        """A unit's result, failed where parts are still missing."""
+        self._take_in_unreported(tasks, deadline=self._deadline if result.ok else 0.0)
+        missing = self._missing(tasks)
+        if result.ok and missing:
+            problem = f"it ended without {len(missing)} of its parts, the first is {part_file(missing[0])}"
+            return dataclasses.replace(result, ok=False, error=problem)
+        return result
+
+    def _take_in_unreported(self, tasks: Sequence[Task], *, deadline: float = 0.0) -> None:
+        """Takes in parts whose messages were lost, with the worker that published them."""
+        for task in tasks:
+            self._ledger.take_in_unreported(task.index, deadline=deadline)
+
+    def _on_message(self, unit: str, message: Mapping[str, Any], log: EventLog) -> None:
+        if message["kind"] == "steps":
+            self._steps_done += message["count"]
+            log.write(self._event("steps", unit, unit))
+            return
+        if message["kind"] == "warning":
+            log.write(self._event("warning", f"{unit}: {message['message']}", unit))
+            return
+        published = Published.from_message(message)
+        if self._ledger.take_in(published, deadline=self._deadline):
+            log.write(self._event("part", f"{unit}, step {published.entry.step}", unit))
+
+    def _event(self, kind: EventKind, message: str, unit: str | None = None) -> BuildEvent:
+        return BuildEvent(
+            kind=kind,
+            unit=unit,
+            tasks_done=self._ledger.num_tasks_done,
+            tasks_total=len(self._plan.wanted),
+            parts_done=self._ledger.num_parts,
+            parts_total=self._ledger.num_parts + self._ledger.num_missing,
+            steps_done=self._steps_done,
+            steps_total=self._steps_total,
+            message=message,
+        )
+
+
+def _unit_id(tasks: Sequence[Task]) -> str:
+    first, last = tasks[0].index, tasks[-1].index
+    return f"task {first}" if len(tasks) == 1 else f"{len(tasks)} tasks from {first} to {last}"
+
+
+def _failure(result: Result) -> str:
+    return f"{result.id} failed after {result.attempt} attempt(s) on {result.node}: {result.error}"

@@ -9,11 +9,14 @@ from typing import Any
 
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.engine.base import BaseEngine, NodeReport, Unit
+from tcmrl_data.engine.worker import Send, serve
+from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import STAGING, make_folders, write_file
 from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.locks import wait_until_visible
 from tcmrl_data.store.platform import Platform
 
-WORKER = "tcmrl_data.building.node_worker"
+WORKER = "tcmrl_data.building.nodes"
 """Module that describes a machine."""
 
 FOLDER_SECONDS = 30.0
@@ -40,10 +43,10 @@ def check_nodes(engine: BaseEngine, plan: BuildPlan, out: Path) -> tuple[str, ..
     Raises:
         BuildError: names the machines that do not see the folder, have other versions or do not answer.
     """
+    if not engine.takes_address:
+        return ()
     with _token(out) as token:
         reports = engine.run_on_every_node(_unit(plan, token))
-    if not reports:
-        return ()
     here = Platform.model_validate(plan.platform.model_dump(mode="json"))  # as the other machines send theirs
     problems: dict[str, list[str]] = {}
     notes: dict[str, list[str]] = {}
@@ -128,3 +131,25 @@ def _nodes(names: Sequence[str]) -> str:
     named = ", ".join(sorted(names)[:MOST_NAMED])
     more = f" and {len(names) - MOST_NAMED} more" if len(names) > MOST_NAMED else ""
     return f"node {named}{more}" if len(names) == 1 else f"nodes {named}{more}:"
+
+
+def work(spec: dict[str, Any], report: Send) -> str:
+    """Reports what the machine sees of the dataset's folder, its version and its platform."""
+    sees = wait_until_visible(Path(spec["token"]), deadline=spec["deadline"])
+    report({"kind": "node", "sees_folder": sees, "tcmrl": version("tcmrl")})
+    if sees and version("tcmrl") == spec["tcmrl"]:
+        report({"kind": "platform", "platform": _platform(spec["recipe"])})
+    return ""
+
+
+def _platform(recipe: dict[str, Any]) -> dict[str, Any]:
+    from tcmrl_data.recipe.recipe import Recipe
+    from tcmrl_data.store.platform import this_platform
+
+    resolved = Recipe.model_validate_json(canonical_json(recipe))
+    platform = this_platform(resolved.make_environment(), resolved.behavior.source)
+    return platform.model_dump(mode="json")
+
+
+if __name__ == "__main__":
+    serve(work)

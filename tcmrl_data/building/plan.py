@@ -134,6 +134,11 @@ def plan_build(
     both = {*(tasks or ())} & {*dropped}
     if both:
         raise TaskError(f"task {min(both)} is to be built and to be dropped; name it once")
-    chosen = choose_tasks(recipe, tasks)
-    named = {task.index: task for task in [*chosen, *choose_tasks(recipe, dropped)]}
-    return BuildPlan.of_tasks(recipe, seed=seed, tasks=named.values(), dropped=dropped)
+    environment = recipe.make_environment()
+    chosen = choose_tasks(recipe, tasks, environment=environment)
+    if dropped:
+        others = choose_tasks(
+            recipe, sorted({*dropped} - {task.index for task in chosen}), environment=environment
+        )
+        chosen += others
+    return BuildPlan(recipe, seed, environment, _ordered(chosen), frozenset(dropped))

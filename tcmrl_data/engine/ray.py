@@ -1,7 +1,8 @@
 """The Ray engine: worker processes on a Ray cluster whose machines share the data folder.
 
-A Ray task runs one attempt in a worker process on its machine and returns a digest; data never pass through
-Ray. If Ray loses a machine it repeats the machine's tasks, so that a unit may run twice at the same time.
+A Ray task runs a unit in a worker process on its machine, as the local engine does, and returns a digest;
+data never pass through Ray. Ray places the tasks by the resources of their units and repeats those of a
+machine that is lost, so that a unit may run twice at the same time.
 """
 
 import contextlib
@@ -13,13 +14,13 @@ from collections import deque
 from collections.abc import Generator, Iterator, Mapping, Sequence
 from typing import Any, final
 
-from tcmrl_data.engine._attempt import GRACE_SECONDS, Outcome, run_attempt
-from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, NodeReport, Result, Unit, longest_first
+from tcmrl_data.engine.base import BaseEngine, Message, NodeReport, Result, Unit, longest_first
+from tcmrl_data.engine.local import GRACE_SECONDS, Outcome, run_attempt, run_attempts
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.machine import available_cores, size
 
 LOST_RETRIES = 3
-"""How often Ray repeats an attempt whose machine was lost."""
+"""How often Ray repeats a unit whose machine was lost."""
 
 POLL_SECONDS = 0.2
 CONNECT_SECONDS = 10.0
@@ -60,26 +61,23 @@ class _Run:
     """The waiting and the running units of one call of `run`."""
 
     def __init__(self, ray: Any, units: Sequence[Unit], most_at_once: int) -> None:
+        from ray.util.queue import Queue
+
         self._ray, self._most_at_once = ray, most_at_once
-        self._waiting = deque((unit, 1) for unit in longest_first(units))
-        self._running: dict[Any, tuple[Unit, int]] = {}
-        self._mailbox = _start_mailbox(ray)
+        self._waiting = deque(longest_first(units))
+        self._running: dict[Any, Unit] = {}
+        self._messages = Queue(actor_options={"num_cpus": 0, "max_restarts": -1})
 
     def results(self, on_message: Message) -> Generator[Result, None, None]:
         """Yields one result per unit, as units end."""
         while self._waiting or self._running:
             while self._waiting and len(self._running) < self._most_at_once:
-                self._submit(*self._waiting.popleft())
+                self._submit(self._waiting.popleft())
             ended, _ = self._ray.wait(list(self._running), timeout=POLL_SECONDS)
-            for message in self._messages():
+            for message in self._take_messages():
                 on_message(*message)
             for reference in ended:
-                unit, attempt = self._running.pop(reference)
-                outcome, node = self._outcome(reference)
-                if outcome.crash and attempt < ATTEMPTS:
-                    self._waiting.appendleft((unit, attempt + 1))
-                else:
-                    yield outcome.result(unit, attempt=attempt, node=node)
+                yield self._result(self._running.pop(reference), reference)
 
     def stop(self) -> None:
         """Cancels the running units; kills those that do not end in time."""
@@ -90,9 +88,9 @@ class _Run:
             _, running = ray.wait(references, num_returns=len(references), timeout=2 * GRACE_SECONDS)
             for reference in running:
                 ray.cancel(reference, force=True)
-        ray.kill(self._mailbox)
+        self._messages.shutdown(force=True)
 
-    def _submit(self, unit: Unit, attempt: int) -> None:
+    def _submit(self, unit: Unit) -> None:
         task = self._ray.remote(_supervise).options(
             name=unit.id,
             num_cpus=unit.cpus,
@@ -100,58 +98,34 @@ class _Run:
             memory=unit.memory or None,
             max_retries=LOST_RETRIES,
         )
-        self._running[task.remote(unit, self._mailbox)] = (unit, attempt)
+        self._running[task.remote(unit, self._messages)] = unit
 
-    def _outcome(self, reference: Any) -> tuple[Outcome, str]:
-        """How an attempt ended, and the name of its machine."""
+    def _result(self, unit: Unit, reference: Any) -> Result:
         try:
-            outcome, node = self._ray.get(reference)
+            result: Result = self._ray.get(reference)
         except self._ray.exceptions.RayError as error:
-            return Outcome(crash=_reason(error)), "the cluster"
-        return outcome, node
+            return Result(unit.id, False, None, _reason(error), LOST_RETRIES + 1, "the cluster")
+        return result
 
-    def _messages(self) -> list[tuple[str, Mapping[str, Any]]]:
-        """Messages since the last call; empty if the mailbox cannot be reached."""
+    def _take_messages(self) -> list[tuple[str, Mapping[str, Any]]]:
+        """Messages since the last call; empty if the machine that holds them was lost."""
         with contextlib.suppress(self._ray.exceptions.RayError):
-            messages: list[tuple[str, Mapping[str, Any]]] = self._ray.get(
-                self._mailbox.take.remote(), timeout=GRACE_SECONDS
+            messages: list[tuple[str, Mapping[str, Any]]] = self._messages.get_nowait_batch(
+                self._messages.qsize()
             )
             return messages
         return []
 
 
-class _Mailbox:
-    """Stores messages until the driver takes them; a Ray actor on the driver's machine."""
-
-    def __init__(self) -> None:
-        self._messages: list[tuple[str, Mapping[str, Any]]] = []
-
-    def put(self, unit: str, message: Mapping[str, Any]) -> None:
-        """Adds a message of a unit."""
-        self._messages.append((unit, message))
-
-    def take(self) -> list[tuple[str, Mapping[str, Any]]]:
-        """Returns and forgets the stored messages."""
-        messages, self._messages = self._messages, []
-        return messages
-
-
-def _start_mailbox(ray: Any) -> Any:
-    from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
-
-    here = NodeAffinitySchedulingStrategy(ray.get_runtime_context().get_node_id(), soft=True)
-    return ray.remote(_Mailbox).options(num_cpus=0, max_restarts=-1, scheduling_strategy=here).remote()
-
-
-def _supervise(unit: Unit, mailbox: Any) -> tuple[Outcome, str]:
-    """Runs one attempt on a machine of the cluster; returns its outcome and the machine's name."""
+def _supervise(unit: Unit, messages: Any) -> Result:
+    """Runs a unit on a machine of the cluster."""
     from ray.exceptions import RayError
 
     def on_message(message: Mapping[str, Any]) -> None:
         with contextlib.suppress(RayError):
-            mailbox.put.remote(unit.id, message)
+            messages.put_nowait((unit.id, message))
 
-    return run_attempt(unit, on_message, threading.Event()), socket.gethostname()
+    return run_attempts(unit, on_message, threading.Event())
 
 
 def _run_on_every_node(ray: Any, unit: Unit) -> list[NodeReport]:

@@ -5,6 +5,7 @@ from itertools import groupby
 
 import numpy as np
 
+from tcmrl_data.envs.base import Environment
 from tcmrl_data.envs.tasks import Task, draw_tasks, in_order
 from tcmrl_data.foundation.errors import TaskError
 from tcmrl_data.recipe.recipe import Recipe
@@ -30,15 +31,22 @@ def spread(tasks: Sequence[Task], *, num_train: int, num_test: int, is_circular:
     return sorted(chosen)
 
 
-def choose_tasks(recipe: Recipe, indices: Sequence[int] | None = None) -> list[Task]:
+def choose_tasks(
+    recipe: Recipe, indices: Sequence[int] | None = None, *, environment: Environment | None = None
+) -> list[Task]:
     """The tasks with the given indices, or else those of the recipe's profile, ascending.
 
     A profile's tasks are evenly spaced along the environment's ordering, or by index if it has none.
 
+    Args:
+        recipe: the recipe.
+        indices: of the tasks; None for the profile's choice.
+        environment: the recipe's, if it was made before.
+
     Raises:
         TaskError: an index does not exist, or the profile has more tasks than the task set.
     """
-    environment = recipe.make_environment()
+    environment = environment or recipe.make_environment()
     tasks = draw_tasks(environment)
     if indices is None:
         num_train, num_test = (
