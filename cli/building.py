@@ -162,6 +162,14 @@ def plan(
     show_default="a new local cluster",
     help="Address of a running Ray cluster that can access the dataset's folder.",
 )
+@click.option(
+    "--checkpoint-every",
+    type=click.FloatRange(min=0),
+    metavar="SECONDS",
+    default=60.0,
+    show_default=True,
+    help="Least time between two checkpoints of behavior training; 0 for as many as possible.",
+)
 def build(
     name_or_file: str,
     profile: Profile,
@@ -176,13 +184,15 @@ def build(
     seed: int,
     drop_tasks: str | None,
     ray_address: str | None,
+    checkpoint_every: float,
 ) -> None:
     """Build a dataset, or the missing parts of one.
 
     ENV is an environment with a recipe, and FILE is a recipe of your own. FILE ends in .toml and names its
     environment in the table [environment].
 
-    A complete dataset is not changed. If a build was stopped, the same command continues it. With other
+    A complete dataset is not changed. If a build was stopped, the same command continues it: Ctrl-C and
+    SIGTERM leave a checkpoint of every training, and a kill the one before. With other
     indices in --tasks, the command adds tasks to the dataset. The parts of tasks in --drop-tasks stay on disk
     but no longer belong to the dataset, until a build names the tasks in --tasks.
 
@@ -209,6 +219,7 @@ def build(
             workers=workers,
             engine=engine,
             address=ray_address,
+            checkpoint_seconds=checkpoint_every,
             progress=lambda event: show_build(event, progress),
         )
     if as_json:

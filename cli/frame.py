@@ -16,7 +16,7 @@ import click
 
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.startup import leave_out_compiler, sleep_soon
+from tcmrl_data.foundation.process import ENDING, leave_out_compiler, open_closed_streams, sleep_soon
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -42,10 +42,11 @@ FOLDED_WIDTH = 12
 
 
 def main_program(command: click.Command) -> NoReturn:
-    """Runs this process's command line and exits; the first Ctrl-C or SIGTERM raises KeyboardInterrupt.
+    """Runs this process's command line and exits; Ctrl-C, SIGTERM or SIGHUP raises KeyboardInterrupt once.
 
     Further signals are ignored, because they would interrupt the cleanup.
     """
+    open_closed_streams()
     leave_out_compiler()
     sleep_soon()
     obeyed = False
@@ -56,8 +57,8 @@ def main_program(command: click.Command) -> NoReturn:
             obeyed = True
             raise KeyboardInterrupt
 
-    for number in (signal.SIGINT, signal.SIGTERM):
-        # A shell ignores these signals for background jobs; that must stay so.
+    for number in ENDING:
+        # A shell ignores these signals for background jobs, as nohup does; that must stay so.
         if signal.getsignal(number) != signal.SIG_IGN:
             signal.signal(number, interrupt)
     try:
@@ -67,7 +68,7 @@ def main_program(command: click.Command) -> NoReturn:
             raise
         code = _fail(INTERRUPTED, INCOMPLETE)  # an interrupted library may raise anything
     if obeyed:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in ENDING:
             signal.signal(number, signal.SIG_IGN)  # our handler does not work while the interpreter exits
     sys.exit(code)
 

@@ -111,8 +111,9 @@ def train(
     """Meta-train on the training tasks of a dataset.
 
     MANIFEST is the dataset's folder or its manifest.json. The training settings are those of the dataset's
-    recipe; --set overrides single values. Ctrl-C and SIGTERM save a checkpoint. --resume continues a run
-    that was stopped or killed; the result is that of an uninterrupted run.
+    recipe; --set overrides single values. Ctrl-C, SIGTERM and SIGHUP save a checkpoint and end the run;
+    SIGUSR1 saves one, and the run continues. --resume continues a run that was stopped or killed; the result
+    is that of an uninterrupted run.
 
     \b
     Examples:

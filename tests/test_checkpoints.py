@@ -1,10 +1,13 @@
+import contextlib
+import dataclasses
 import json
 import os
+import signal
 import subprocess
 import sys
-from collections.abc import Callable, Generator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
+from types import FrameType, MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -22,7 +25,8 @@ from tcmrl_data.foundation.disk import CHECKPOINTS
 from tests.conftest import TINY
 from tests.datasets import part_ids
 from tests.platforms import AVX2
-from tests.training_of_behavior import assert_resumes
+from tests.training_of_behavior import Digests, Interrupted, assert_resumes, context_of, digests
+from tests.workers import PATIENCE, command_line, wait_for, worker_pids
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
@@ -55,6 +59,55 @@ def test_a_resumed_training_equals_an_uninterrupted_one(
 ) -> None:
     recipe = load_recipe(name, profile="quick", overrides=overrides)
     assert_resumes(recipe, [2], tmp_path, stop_at=stop_at)
+
+
+LATER = ("behavior.sac.steps=2000", "behavior.sac.snapshots=[0,100,2000]")
+
+
+@pytest.fixture
+def ending() -> Iterator[None]:
+    """SIGTERM raises, as in a worker."""
+
+    def end(number: int, frame: FrameType | None) -> None:
+        raise Interrupted
+
+    earlier = signal.signal(signal.SIGTERM, end)
+    yield
+    signal.signal(signal.SIGTERM, earlier)
+
+
+@pytest.mark.usefixtures("ending")
+@pytest.mark.parametrize("source", ["sac", "stacked"])
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_signal_leaves_a_checkpoint_of_the_training(
+    source: str, number: signal.Signals, tmp_path: Path
+) -> None:
+    """No checkpoint is due by time; SIGTERM ends the training behind it, SIGUSR1 does not."""
+    overrides = [*TINY, f"behavior.source={source}", *LATER]
+    recipe = load_recipe("point-robot", profile="quick", overrides=overrides)
+    straight = digests(recipe, context_of(recipe, [2], tmp_path / "straight"))
+    steps = 0
+
+    def report(count: int) -> None:
+        nonlocal steps
+        steps += count
+        if steps - count < 250 <= steps:
+            signal.raise_signal(number)
+
+    told = dataclasses.replace(context_of(recipe, [2], tmp_path), report=report)
+    made: Digests = {}
+    try:
+        for task, snapshot in recipe.make_source().snapshots(told):
+            made[task.index, snapshot.step] = snapshot.digest()
+    except Interrupted:
+        assert number == signal.SIGTERM and set(made) == {(2, 0), (2, 100)}
+    else:
+        assert number == signal.SIGUSR1 and made == straight
+    context = context_of(recipe, [2], tmp_path)
+    state = context.checkpoints(context.tasks).load()
+    assert state is not None and 250 <= state.values["steps"] < 2_000
+    later = digests(recipe, context)
+    assert made | later == straight and set(later) == {(2, 2_000)}
 
 
 @pytest.fixture
@@ -171,3 +224,87 @@ def test_a_damaged_checkpoint_is_ignored(saved: Callable[[], Path]) -> None:
     data[-1] ^= 1
     file.write_bytes(data)
     assert folder(dataset).load() is None
+
+
+STEPS = 3_000
+LONG = (
+    *TINY,
+    f"behavior.sac.steps={STEPS}",
+    f"behavior.sac.snapshots=[0,{STEPS}]",
+    "behavior.sac.train_frequency=1",
+)
+"""Two parts alone: what lies between them is kept by checkpoints, possible every 100 steps, or not at all."""
+
+
+def long_build(out: Path, checkpoint_every: float) -> list[str]:
+    settings = [argument for override in LONG for argument in ("--set", override)]
+    command = ["build", "point-robot", "--profile", "quick", *settings, "--tasks", "3", "--workers", "1"]
+    return [*command, "--checkpoint-every", str(checkpoint_every), "--out", str(out)]
+
+
+def saved_steps(out: Path) -> int:
+    """Steps of the newest checkpoint of a build; 0 where there is none."""
+    for file in out.glob(f"{CHECKPOINTS}/*/*.safetensors"):
+        with contextlib.suppress(OSError, ValueError):
+            data = file.read_bytes()
+            header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
+            return int(json.loads(header["__metadata__"]["state"])["values"]["steps"])
+    return 0
+
+
+@pytest.fixture(scope="module")
+def long_ids(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[int, int], str]:
+    """The parts of a build that nobody stops."""
+    out = tmp_path_factory.mktemp("straight")
+    tcmrl_data.build_dataset(load_recipe("point-robot", profile="quick", overrides=LONG), out, tasks=[3])
+    return part_ids(out)
+
+
+@pytest.mark.check
+def test_a_build_killed_after_every_second_checkpoint_ends_in_the_same_parts(
+    long_ids: dict[tuple[int, int], str], mark: str, tmp_path: Path
+) -> None:
+    out, kept = tmp_path / "data", [0]
+    for _ in range(3):
+        with command_line(*long_build(out, 0)) as driver:
+            seen = {kept[-1]}
+
+            def has_saved_twice() -> bool:
+                seen.add(saved_steps(out))  # noqa: B023
+                return len(seen) > 2 or driver.poll() is not None  # noqa: B023
+
+            wait_for(has_saved_twice, "two checkpoints")
+            assert driver.poll() is None
+            for pid in worker_pids(mark):
+                os.kill(pid, signal.SIGKILL)
+            driver.kill()
+        wait_for(lambda: not worker_pids(mark), "the end of the workers")
+        kept.append(saved_steps(out))
+    assert kept == sorted(set(kept)) and kept[-1] < STEPS  # every start went on from the checkpoint before
+    with command_line(*long_build(out, 0)) as driver:
+        _, errors = driver.communicate(timeout=PATIENCE)
+    assert (driver.returncode, part_ids(out)) == (0, long_ids), errors
+
+
+@pytest.mark.check
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_build_leaves_a_checkpoint_of_its_training(
+    number: signal.Signals, long_ids: dict[tuple[int, int], str], tmp_path: Path
+) -> None:
+    """None was due by time."""
+    out = tmp_path / "data"
+    with command_line(*long_build(out, 3_600)) as driver:
+        wait_for(lambda: status_steps(out) > 0 or driver.poll() is not None, "training")
+        driver.send_signal(number)
+        _, errors = driver.communicate(timeout=PATIENCE)
+    assert driver.returncode == 1, errors
+    assert 0 < saved_steps(out) < STEPS
+    with command_line(*long_build(out, 3_600)) as driver:
+        _, errors = driver.communicate(timeout=PATIENCE)
+    assert (driver.returncode, part_ids(out)) == (0, long_ids), errors
+
+
+def status_steps(out: Path) -> int:
+    """Steps of training that the build has recorded."""
+    lines = (out / EVENTS).read_text().splitlines() if (out / EVENTS).is_file() else []
+    return max([json.loads(line)["steps_done"] for line in lines], default=0)

@@ -1,4 +1,6 @@
 import json
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +14,7 @@ from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store.manifest import MANIFEST
 from tests.commands import Call, assert_refused, in_process
 from tests.conftest import TASKS, TINY
+from tests.workers import ROOT
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
@@ -279,3 +282,22 @@ def test_recipe_prints_the_values_of_a_recipe_as_json(call: Call, tmp_path: Path
     assert {"key": "environment.horizon", "value": 20, "source": "published code"} in document["values"]
     assert json.loads(call("recipe", "point-robot", "--profile", "quick", "--json")[1]) == document
     assert_refused(call("recipe", "point-robot", "--set", "rollouts.lane=1"), "rollouts.lane", "lanes")
+
+
+def test_a_command_without_an_output_ends_in_silence(tiny_folder: Path) -> None:
+    """As `tcmrl-data show d >&-` in a shell, which leaves the number of the stream to the next open file."""
+    code = "from tcmrl_cli.data import main; main()"
+    shell = [
+        "sh",
+        "-c",
+        'exec "$@" >&-',
+        "sh",
+        sys.executable,
+        "-c",
+        code,
+        "show",
+        str(tiny_folder),
+        "--quiet",
+    ]
+    result = subprocess.run(shell, cwd=ROOT, stderr=subprocess.PIPE, text=True, check=False)
+    assert (result.returncode, result.stderr) == (0, "")

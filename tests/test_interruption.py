@@ -59,6 +59,20 @@ def test_an_interrupted_run_saves_its_step_and_ends_in_the_same_tensors(
 
 
 @pytest.mark.check
+def test_slurms_warning_saves_a_checkpoint_and_the_run_goes_on(tiny: Dataset, tmp_path: Path) -> None:
+    config = config_of(tiny)
+
+    def warn(progress: TrainingProgress) -> None:
+        if progress.step == 30:
+            signal.raise_signal(signal.SIGUSR1)
+
+    report = train_run(tiny, tmp_path, config=config, profile="quick", steps=40, report=warn)
+    assert [checkpoint.step for checkpoint in open_run(tmp_path).checkpoints()] == [30, 40]  # not [25, 40]
+    straight = train_run(tiny, tmp_path / "straight", config=config, profile="quick", steps=40)
+    assert report.digest == straight.digest
+
+
+@pytest.mark.check
 def test_a_run_killed_before_its_first_checkpoint_says_that_it_begins_anew(
     tiny: Dataset, tmp_path: Path
 ) -> None:
@@ -73,7 +87,7 @@ def test_a_run_killed_before_its_first_checkpoint_says_that_it_begins_anew(
 
 
 @pytest.mark.check
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_command_that_an_interrupted_training_prints_goes_on(
     tiny_folder: Path, tmp_path: Path, call: Call, number: signal.Signals
 ) -> None:

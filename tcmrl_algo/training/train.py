@@ -17,11 +17,11 @@ from tcmrl_algo.methods.problem import MomentsRecord, problem_of
 from tcmrl_algo.training.batches import StagedBatches, open_batches
 from tcmrl_algo.training.checkpoint import Run, RunRecord, open_run, tensors_digest, write_run
 from tcmrl_algo.training.config import TrainingConfig, method_of, stage_plan
-from tcmrl_algo.training.interruption import DeferredInterrupts
 from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_algo.training.metrics import MetricsWriter
 from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError
 from tcmrl_data.foundation.errors import DivergenceError
+from tcmrl_data.foundation.process import DeferredInterrupts
 
 PACKAGES = ("torch", "numpy")
 """Whose versions results depend on."""
@@ -247,7 +247,7 @@ def _train(
     start: int,
     report: Callable[[TrainingProgress], None],
 ) -> TrainingReport:
-    """The loop: batch n - 1 makes step n; Ctrl-C and SIGTERM take effect after a checkpoint of their step."""
+    """The loop: batch n - 1 makes step n; signals take effect after a checkpoint of their step."""
     settings, last = run.record.config.settings.run, run.record.steps
     stages, window_length = stage_plan(run.record.config), run.record.config.settings.batch.window_length
     keep_freed_memory()
@@ -273,9 +273,10 @@ def _train(
                 writer.write(step, values | about | times, stage=stage)
                 report(TrainingProgress(step, last, stage, rate, share, values))
             stopping = interrupts.received
-            if step % settings.checkpoint_every == 0 or step == last or stopping:
+            if step % settings.checkpoint_every == 0 or step == last or interrupts.checkpoint_wanted:
                 _check_finite(algorithm.tensors(), step)
                 run.save(step, algorithm.tensors())
+                interrupts.checkpoint_written()
             if stopping:
                 break  # the signal takes effect as the block ends
     return TrainingReport(run, last, time.perf_counter() - began, tensors_digest(algorithm.tensors()))

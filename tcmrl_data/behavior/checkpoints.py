@@ -5,9 +5,10 @@ JSON. Nothing is pickled. A checkpoint that is damaged or has another key is ign
 again from the beginning. If a checkpoint cannot be written, training continues.
 """
 
+import contextlib
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import numpy.typing as npt
 from tcmrl_data.foundation.canonical import canonical_json, parse_json, sha256
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, named_errors, remove_tree, replace_file
 from tcmrl_data.foundation.errors import StorageError
+from tcmrl_data.foundation.process import DeferredInterrupts
 
 CHECKPOINT_SECONDS = 60.0
 CHECKPOINT_SHARE = 0.05
@@ -58,19 +60,29 @@ class CheckpointFolder:
         key: str,
         missing: Mapping[int, int],
         seconds: float = CHECKPOINT_SECONDS,
-        warn: Callable[[str], None] = lambda message: None,
+        warn: Callable[[str], None] | None = None,
     ) -> None:
         self._dataset, self._folder = dataset, dataset / CHECKPOINTS / unit
         self._key, self._missing, self._warn, self._has_warned = key, missing, warn, False
         self._seconds, self._saved, self._cost = seconds, time.monotonic(), 0.0
+        self._interrupts = DeferredInterrupts()
+
+    @contextlib.contextmanager
+    def training(self) -> Iterator[None]:
+        """Holds back signals that end the process until the next checkpoint, or until its block is left.
+
+        Nothing may be yielded within the block: it is for the steps from one snapshot to the next.
+        """
+        with DeferredInterrupts() as self._interrupts:
+            yield
 
     def is_due(self) -> bool:
-        """Whether it is time for a checkpoint; slow checkpoints are written less often."""
+        """Whether it is time for a checkpoint, or a signal waits for one; slow ones are less often due."""
         wait = max(self._seconds, self._cost / CHECKPOINT_SHARE) if self._seconds else 0.0
-        return time.monotonic() - self._saved >= wait
+        return self._interrupts.checkpoint_wanted or time.monotonic() - self._saved >= wait
 
     def save(self, checkpoint: TrainingState) -> None:
-        """Writes a checkpoint and removes the previous one.
+        """Writes a checkpoint and removes the previous one; then a signal that waited takes effect.
 
         If the file cannot be written, the previous one stays and a warning is given.
         """
@@ -78,11 +90,14 @@ class CheckpointFolder:
         try:
             self._write(checkpoint)
         except StorageError as error:
-            if not self._has_warned:
+            if self._warn is not None and not self._has_warned:
                 self._warn(f"training goes on without a new checkpoint: {error}")
             self._has_warned = True
         self._saved = time.monotonic()
         self._cost = self._saved - began
+        self._interrupts.checkpoint_written()
+        if self._interrupts.received:
+            self._interrupts.obey()
 
     def _write(self, checkpoint: TrainingState) -> None:
         from safetensors.numpy import save

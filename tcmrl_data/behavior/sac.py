@@ -145,15 +145,16 @@ class SacSource(SacTraining):
             steps_done = restore(model, episodes, checkpoint)
             context.report(steps_done)
         for step in settings.snapshots:
-            while model.num_timesteps < step:
-                chunk = min(REPORT_EVERY * settings.train_frequency, step - model.num_timesteps)
-                if checkpoints.is_due():
-                    if episodes.at_border:
-                        checkpoints.save(capture(model, episodes))
-                    else:
-                        chunk = settings.train_frequency
-                model.learn(chunk, reset_num_timesteps=False)
-                context.report(chunk)
+            with checkpoints.training():
+                while model.num_timesteps < step:
+                    chunk = min(REPORT_EVERY * settings.train_frequency, step - model.num_timesteps)
+                    if checkpoints.is_due():
+                        if episodes.at_border:
+                            checkpoints.save(capture(model, episodes))
+                        else:
+                            chunk = settings.train_frequency
+                    model.learn(chunk, reset_num_timesteps=False)
+                    context.report(chunk)
             if step > steps_done:
                 yield snapshot_of_sac(model, step=step, observation=context.observation)
 

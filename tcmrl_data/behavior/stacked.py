@@ -81,14 +81,15 @@ class StackedSource(SacTraining):
                 diverged |= {int(task): step for task, step in checkpoint.values["failed"].items()}
                 context.report(steps_done * len(context.tasks))
             for step in self.settings.snapshots:
-                while training.steps < step:
-                    if checkpoints.is_due():
-                        checkpoints.save(training.capture(failed=diverged))
-                    chunk = min(REPORT_EVERY, step - training.steps)
-                    with _matmul_precision(self.settings.matmul_precision):
-                        for _ in range(chunk):
-                            training.advance()
-                    context.report(chunk * len(context.tasks))
+                with checkpoints.training():
+                    while training.steps < step:
+                        if checkpoints.is_due():
+                            checkpoints.save(training.capture(failed=diverged))
+                        chunk = min(REPORT_EVERY, step - training.steps)
+                        with _matmul_precision(self.settings.matmul_precision):
+                            for _ in range(chunk):
+                                training.advance()
+                        context.report(chunk * len(context.tasks))
                 for agent, task in enumerate(context.tasks if step > steps_done else ()):
                     snapshot = training.snapshot(agent)
                     if all(np.isfinite(array).all() for array in snapshot.tensors.values()):

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, final
 
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
-from tcmrl_data.behavior.checkpoints import CheckpointFolder
+from tcmrl_data.behavior.checkpoints import CHECKPOINT_SECONDS, CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.work_files import checkpoint_name
@@ -37,6 +37,7 @@ class UnitSpec:
         seed: root seed of the build.
         tasks: the unit's tasks, which are trained together.
         dropped: indices of tasks of which no parts are made.
+        checkpoint_seconds: least time between two checkpoints of behavior training.
     """
 
     dataset: Path
@@ -44,6 +45,7 @@ class UnitSpec:
     seed: int
     tasks: tuple[Task, ...]
     dropped: frozenset[int] = frozenset()
+    checkpoint_seconds: float = CHECKPOINT_SECONDS
 
     def to_json(self) -> dict[str, Any]:
         """JSON form."""
@@ -53,6 +55,7 @@ class UnitSpec:
             "seed": self.seed,
             "tasks": [[task.index, task.split, dict(task.parameters)] for task in self.tasks],
             "dropped": sorted(self.dropped),
+            "checkpoint_seconds": self.checkpoint_seconds,
         }
 
     @classmethod
@@ -60,8 +63,9 @@ class UnitSpec:
         """The inverse of `to_json`."""
         recipe = Recipe.model_validate_json(canonical_json(values["recipe"]))
         tasks = tuple(Task(index, split, parameters) for index, split, parameters in values["tasks"])
+        dropped = frozenset(values["dropped"])
         return cls(
-            Path(values["dataset"]), recipe, values["seed"], tasks, frozenset(values.get("dropped", ()))
+            Path(values["dataset"]), recipe, values["seed"], tasks, dropped, values["checkpoint_seconds"]
         )
 
 
@@ -75,8 +79,10 @@ def run_unit(spec: UnitSpec, report: Send) -> str:
         NondeterminismError: a part published on an equal platform has another policy.
     """
     plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks, dropped=spec.dropped)
-    if any(_missing_steps(spec, plan.source, task) for task in plan.wanted):
-        _make_parts(spec, plan, report)
+    missing = {task.index: _missing_steps(spec, plan.source, task) for task in plan.wanted}
+    missing = {index: steps for index, steps in missing.items() if steps}
+    if missing:
+        _make_parts(spec, plan, missing, report)
     keys = [PartKey(task.index, step) for task in plan.wanted for step in plan.source.steps]
     return digest([_part_id(spec.dataset / part_file(key)) for key in keys])
 
@@ -143,7 +149,8 @@ def _part_id(file: Path) -> str:
         return read_part_record(archive).id
 
 
-def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
+def _make_parts(spec: UnitSpec, plan: BuildPlan, missing: Mapping[int, Sequence[int]], report: Send) -> None:
+    """Makes the missing snapshot steps, by task index."""
     source = plan.source
     context = BehaviorContext(
         environment=plan.environment,
@@ -152,14 +159,13 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
         observation=spec.recipe.behavior.observation,
         reward=spec.recipe.behavior.reward,
         report=lambda count: report({"kind": "steps", "count": count}),
-        checkpoints=lambda tasks: _checkpoints(spec, plan, tasks, report),
+        checkpoints=lambda tasks: _checkpoints(spec, plan, tasks, missing, report),
     )
-    wanted = {task.index for task in plan.wanted if _missing_steps(spec, source, task)}
     recorded = source.provenance()
     with contextlib.ExitStack() as stack:
         makers: dict[int, PartMaker] = {}
         for task, snapshot in source.snapshots(context):
-            if task.index not in wanted:
+            if task.index not in missing:
                 continue
             if task.index not in makers:
                 makers[task.index] = PartMaker(spec.dataset, plan, task=task, behavior=recorded)
@@ -168,9 +174,9 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, report: Send) -> None:
             if published is not None:
                 report(published.to_message())
             # simulators of many tasks would fill the memory: a group makes them anew for every part
-            if snapshot.step == source.steps[-1] or len(wanted) > 1:
+            if snapshot.step == source.steps[-1] or len(missing) > 1:
                 makers[task.index].close()
-    _checkpoints(spec, plan, spec.tasks, report).clear()
+    _checkpoints(spec, plan, spec.tasks, missing, report).clear()
 
 
 def _missing_steps(spec: UnitSpec, source: BehaviorSource, task: Task) -> list[int]:
@@ -180,7 +186,13 @@ def _missing_steps(spec: UnitSpec, source: BehaviorSource, task: Task) -> list[i
     ]
 
 
-def _checkpoints(spec: UnitSpec, plan: BuildPlan, tasks: Sequence[Task], report: Send) -> CheckpointFolder:
+def _checkpoints(
+    spec: UnitSpec,
+    plan: BuildPlan,
+    tasks: Sequence[Task],
+    missing: Mapping[int, Sequence[int]],
+    report: Send,
+) -> CheckpointFolder:
     """Where the tasks' training keeps its state; bound to everything that the training depends on."""
     key = {
         "data_version": DATA_VERSION,
@@ -189,15 +201,11 @@ def _checkpoints(spec: UnitSpec, plan: BuildPlan, tasks: Sequence[Task], report:
         "tasks": [task.index for task in tasks],
         "platform": plan.platform.digest(),
     }
-    missing = {
-        task.index: _missing_steps(spec, plan.source, task)
-        for task in tasks
-        if task.index not in spec.dropped
-    }
     return CheckpointFolder(
         spec.dataset,
         checkpoint_name(tasks),
         key=digest(key),
-        missing={index: steps[0] for index, steps in missing.items() if steps},
+        missing={task.index: missing[task.index][0] for task in tasks if task.index in missing},
+        seconds=spec.checkpoint_seconds,
         warn=lambda message: report({"kind": "warning", "message": message}),
     )

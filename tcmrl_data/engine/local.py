@@ -64,8 +64,8 @@ def run_attempts(
 
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 POLL_SECONDS = 0.1
-GRACE_SECONDS = 5.0
-"""Seconds between SIGTERM and SIGKILL."""
+GRACE_SECONDS = 10.0
+"""Seconds between SIGTERM and SIGKILL: a training ends its step and writes a checkpoint first."""
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 
 A module becomes a worker by calling `serve`; engines run it as `python -m <module>`. Messages are JSON lines;
 the last one is `{"kind": "result", "digest" | "error"}`. The process ends when standard input closes, so that
-no worker outlives a killed driver. On SIGTERM it abandons the unit: published parts stay, staged files are
-removed.
+no worker outlives a killed driver. On SIGTERM or SIGINT it abandons the unit: a behavior training first
+writes its checkpoint, published parts stay, staged files are removed.
 """
 
 import json
@@ -17,7 +17,7 @@ from types import FrameType
 from typing import Any
 
 from tcmrl_data.foundation.errors import TcmrlError
-from tcmrl_data.foundation.startup import leave_out_compiler
+from tcmrl_data.foundation.process import leave_out_compiler
 
 REPORT_SECONDS = 0.5
 
@@ -57,7 +57,8 @@ def _end_with_the_driver() -> None:
 
 
 def _abandon(signal_number: int, frame: FrameType | None) -> None:
-    signal.signal(signal_number, signal.SIG_IGN)  # a second signal must not interrupt the cleanup
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)  # a second signal must not interrupt the cleanup
     raise SystemExit(128 + signal_number)
 
 
@@ -68,7 +69,8 @@ def serve(work: Callable[[dict[str, Any], Send], str]) -> None:
         work: takes a spec and a receiver of messages, and returns the digest of the work done. A `TcmrlError`
             that it raises becomes the unit's error; the unit is not tried again.
     """
-    signal.signal(signal.SIGTERM, _abandon)
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _abandon)
     leave_out_compiler()
     spec = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
