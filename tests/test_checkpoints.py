@@ -194,7 +194,7 @@ from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.unit import UnitSpec, _checkpoints
 spec = UnitSpec.from_json(json.loads(sys.argv[2]))
 plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks)
-checkpoints = _checkpoints(spec, plan, spec.tasks, print)
+checkpoints = _checkpoints(spec, plan, spec.tasks, {3: plan.source.steps}, print)
 if sys.argv[1] == "save":
     checkpoints.save(TrainingState({"steps": -1}, {"weights": np.zeros(2)}))  # before snapshot 0
 print(checkpoints.load() is not None)
