@@ -10,10 +10,10 @@ from typing import Any
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.engine.base import BaseEngine, NodeReport, Unit
 from tcmrl_data.engine.worker import Send, serve
-from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import STAGING, make_folders, write_file
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.locks import wait_until_visible
+from tcmrl_data.foundation.records import as_model
 from tcmrl_data.store.platform import Platform
 
 WORKER = "tcmrl_data.building.nodes"
@@ -146,7 +146,7 @@ def _platform(recipe: dict[str, Any]) -> dict[str, Any]:
     from tcmrl_data.recipe.recipe import Recipe
     from tcmrl_data.store.platform import this_platform
 
-    resolved = Recipe.model_validate_json(canonical_json(recipe))
+    resolved = as_model(Recipe, recipe)
     platform = this_platform(resolved.make_environment(), resolved.behavior.source)
     return platform.model_dump(mode="json")
 

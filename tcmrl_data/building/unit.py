@@ -16,8 +16,9 @@ from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.work_files import checkpoint_name
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.tasks import Task
-from tcmrl_data.foundation.canonical import canonical_json, digest
+from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.errors import NondeterminismError
+from tcmrl_data.foundation.records import as_model
 from tcmrl_data.parts.making import Published, make_part, publish, read_published
 from tcmrl_data.parts.operation import Simulator, Sources, WantedPart
 from tcmrl_data.parts.rollouts import Rollout, measure_references
@@ -61,7 +62,7 @@ class UnitSpec:
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "UnitSpec":
         """The inverse of `to_json`."""
-        recipe = Recipe.model_validate_json(canonical_json(values["recipe"]))
+        recipe = as_model(Recipe, values["recipe"])
         tasks = tuple(Task(index, split, parameters) for index, split, parameters in values["tasks"])
         dropped = frozenset(values["dropped"])
         return cls(

@@ -5,7 +5,6 @@ Lanes step several episodes together. The names of controllers and trajectories 
 
 import abc
 import importlib.resources
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources.abc import Traversable
@@ -20,6 +19,7 @@ from tcmrl_data.envs.controller import Controller, Transition, View
 from tcmrl_data.envs.trajectory import BoolArray, FloatArray, Trajectory
 from tcmrl_data.foundation.errors import RecipeError, RenderingError
 from tcmrl_data.foundation.plugins import Registry, unknown_name
+from tcmrl_data.foundation.records import as_model
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -365,4 +365,4 @@ def make_environment(settings: Mapping[str, Any]) -> Environment:
         ValidationError: pydantic's; the table is not valid.
     """
     kind = ENVIRONMENTS.get(settings["name"])
-    return kind(kind.Settings.model_validate_json(json.dumps(settings)))
+    return kind(as_model(kind.Settings, settings))

@@ -116,9 +116,9 @@ class DeferredInterrupts:
         earlier, self._earlier = self._earlier, {}
         for number, handler in earlier.items():
             signal.signal(number, handler)
-        number, self._number = self._number, None
-        if number is not None:
-            signal.raise_signal(number)
+        waiting, self._number = self._number, None
+        if waiting is not None:
+            signal.raise_signal(waiting)
 
     def __enter__(self) -> "DeferredInterrupts":
         if threading.current_thread() is threading.main_thread():

@@ -33,6 +33,15 @@ class Record(BaseModel):
 Kind = TypeVar("Kind", bound=BaseModel)
 
 
+def as_model(kind: type[Kind], values: Any) -> Kind:
+    """Parsed JSON as a model; strict, except that a list is taken for a tuple, which JSON has no word for.
+
+    Raises:
+        ValidationError: the values are not valid.
+    """
+    return kind.model_validate_json(canonical_json(values))
+
+
 def write_record(file: Path, record: BaseModel) -> None:
     """Writes a record as JSON, atomically.
 

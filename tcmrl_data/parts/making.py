@@ -14,7 +14,7 @@ from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
-from tcmrl_data.foundation.records import first_problem
+from tcmrl_data.foundation.records import as_model, first_problem
 from tcmrl_data.parts.operation import OPERATIONS, Operation, Simulator, Sources, StoredPart, WantedPart
 from tcmrl_data.parts.playback import Relabel
 from tcmrl_data.parts.rollouts import Extend, Rollout
@@ -82,7 +82,7 @@ def operation_of(identity: Identity, place: str) -> Operation[Any]:
         return Import() if identity.seed is None or identity.policy is None else Rollout()
     kind = operation_named(str(derived.get("operation"))[:64])
     try:
-        return kind(kind.Settings.model_validate_json(canonical_json(derived.get("settings"))))
+        return kind(as_model(kind.Settings, derived.get("settings")))
     except ValidationError as error:
         raise ManifestError(f"{place}: identity.derived.settings: {first_problem(error)}") from None
 
@@ -114,10 +114,7 @@ def make_part(
         step=wanted.step,
         seed=wanted.seed,
         policy=None if snapshot is None else snapshot.digest(),
-        arrays={
-            name: ArrayRecord.model_validate_json(canonical_json(record))
-            for name, record in array_digests(arrays).items()
-        },
+        arrays={name: as_model(ArrayRecord, record) for name, record in array_digests(arrays).items()},
         derived=None if derived is None else dict(derived),
     )
     record = PartRecord(
@@ -239,7 +236,7 @@ class Published:
     @classmethod
     def from_message(cls, message: Mapping[str, Any]) -> "Published":
         """The inverse of `to_message`."""
-        platform = Platform.model_validate_json(canonical_json(message["platform"]))
+        platform = as_model(Platform, message["platform"])
         return cls(PartEntry(*message["entry"]), platform)
 
     def to_message(self) -> dict[str, Any]:

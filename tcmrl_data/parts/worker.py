@@ -11,9 +11,10 @@ from typing import Any
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.engine.base import ENGINES, Unit
 from tcmrl_data.engine.worker import Send, serve
-from tcmrl_data.foundation.canonical import canonical_json, digest
+from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.machine import available_cores
+from tcmrl_data.foundation.records import as_model
 from tcmrl_data.parts.making import (
     NO_REFERENCES,
     Published,
@@ -88,7 +89,7 @@ class DeriveSpec:
             Path(values["out"]),
             values["operation"],
             values["settings"],
-            Recipe.model_validate_json(canonical_json(values["recipe"])),
+            as_model(Recipe, values["recipe"]),
             values["seed"],
             tuple(Job(PartKey(*source), PartKey(*key)) for source, key in values["jobs"]),
         )
@@ -97,7 +98,7 @@ class DeriveSpec:
         """The operation with the settings of the part that is made from `source`."""
         kind = operation_named(self.operation)
         settings = kind.settings_for(self.settings, dataset.task(source.task))
-        return kind(kind.Settings.model_validate_json(canonical_json(settings)))
+        return kind(as_model(kind.Settings, settings))
 
     def units(self, workers: int) -> list[Unit]:
         """The jobs in units of whole tasks, a few for every worker."""

@@ -11,9 +11,8 @@ from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorSource
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment, Reward, TaskSplit, make_environment
 from tcmrl_data.envs.controller import View
 from tcmrl_data.envs.foreign import Foreign
-from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.errors import RecipeError, TcmrlError
-from tcmrl_data.foundation.records import validate_table
+from tcmrl_data.foundation.records import as_model, validate_table
 from tcmrl_data.recipe.about import About, licence_problem, read_about
 from tcmrl_data.recipe.document import merge_tables, open_recipe, read_override
 from tcmrl_data.recipe.profile import Profile
@@ -142,7 +141,7 @@ class Recipe(_Table):
     def make_source(self) -> BehaviorSource:
         """The recipe's behavior source with its settings."""
         kind = BEHAVIOR_SOURCES.get(self.behavior.source)
-        return kind(kind.Settings.model_validate_json(canonical_json(self.behavior.settings)))
+        return kind(as_model(kind.Settings, self.behavior.settings))
 
 
 def load_recipe(
