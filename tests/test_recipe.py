@@ -192,7 +192,6 @@ def test_a_recipe_file_may_hold_variants_by_environment(own_recipe: Path) -> Non
         ("schema = 1", "schema = ", "is no TOML: Invalid value"),
         ("schema = 1", "schema = 1\nbuild = 5", r"build is a value; write it as a table \[build\]"),
         ("[rollouts]", "[rolouts]", "unknown table 'rolouts'; did you mean rollouts"),
-        ("[rollouts]", "[build]", r"lacks the table \[rollouts\]"),
         ("[profiles.quick.build]", "[profiles.quik.build]", "unknown profile 'quik'; did you mean quick"),
         ("schema = 1", "schema = 1\nvariants = 5", "variants holds a value"),
     ],
@@ -207,6 +206,37 @@ def test_a_recipe_file_that_is_none_is_refused_in_one_line(
         load_recipe(own_recipe)
     assert str(caught.value).startswith(str(own_recipe))
     assert "\n" not in str(caught.value)
+
+
+SHORT = """
+schema = 1
+about = { description = "mine", citation = "none", licence = "MIT" }
+environment = { name = "point-robot", tasks = 10, train = 8, horizon = 20 }
+behavior.sac = { steps = 300, warmup = 50, snapshots = [0, 100, 300] }
+behavior.stacked = { group = 4 }
+"""
+
+
+def test_a_recipe_says_only_what_has_no_usual_value(tmp_path: Path) -> None:
+    (tmp_path / "short.toml").write_text(SHORT)
+    recipe = load_recipe(tmp_path / "short.toml")
+    assert (recipe.rollouts.episodes, recipe.rollouts.lanes) == (50, 10)
+    assert (recipe.environment.task_seed, recipe.behavior.source) == (1337, "stacked")
+    assert recipe.behavior.settings["learning_rate"] == 3e-4
+    assert "build" not in {value.key for value in recipe_values(tmp_path / "short.toml").values}
+
+
+def test_all_missing_fields_are_named_at_once(tmp_path: Path) -> None:
+    (tmp_path / "empty.toml").write_text(
+        'schema = 1\nenvironment.name = "point-robot"\nbehavior.stacked.hidden = [8]\n'
+    )
+    with pytest.raises(RecipeError) as caught:
+        load_recipe(tmp_path / "empty.toml")
+    assert str(caught.value) == (
+        f"{tmp_path / 'empty.toml'}, profile 'paper' lacks about.description, about.citation, about.licence, "
+        "environment.tasks, environment.train, environment.horizon, behavior.stacked.steps, "
+        "behavior.stacked.warmup, behavior.stacked.snapshots, behavior.stacked.group; add them"
+    )
 
 
 def test_a_recipe_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "don
 
 
 class SacSettings(BaseModel):
-    """The `[behavior.sac]` table; names as in Stable-Baselines3's SAC, values in the recipes.
+    """The `[behavior.sac]` table; names as in Stable-Baselines3's SAC, defaults of the SAC paper (Table 1).
 
     Attributes:
         hidden: widths of the actor's and the critics' ReLU layers.
@@ -47,15 +47,15 @@ class SacSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    hidden: tuple[int, ...] = Field(min_length=1)
+    hidden: tuple[int, ...] = Field(default=(256, 256), min_length=1)
     steps: int = Field(ge=1)
     warmup: int = Field(ge=0)
     snapshots: tuple[int, ...] = Field(min_length=2)
-    learning_rate: float = Field(gt=0)
-    batch_size: int = Field(ge=1)
-    gamma: float = Field(gt=0, lt=1)
-    tau: float = Field(gt=0, le=1)
-    buffer_size: int = Field(ge=1)
+    learning_rate: float = Field(default=3e-4, gt=0)
+    batch_size: int = Field(default=256, ge=1)
+    gamma: float = Field(default=0.99, gt=0, lt=1)
+    tau: float = Field(default=0.005, gt=0, le=1)
+    buffer_size: int = Field(default=1_000_000, ge=1)
     train_frequency: int = Field(default=1, ge=1)
     gradient_steps: int = Field(default=1, ge=1)
     entropy: Literal["auto"] | Annotated[float, Field(gt=0, allow_inf_nan=False)] = "auto"

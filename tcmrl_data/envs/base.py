@@ -72,7 +72,8 @@ class EnvironmentSettings(BaseModel):
 
     Attributes:
         name: the environment's name.
-        task_seed: seed of the task parameters and of the split; independent of a build's `--seed`.
+        task_seed: seed of the task parameters and of the split, by default that of the published code;
+            independent of a build's `--seed`.
         tasks: number of tasks.
         train: number of training tasks.
         horizon: steps after which an episode is truncated.
@@ -86,7 +87,7 @@ class EnvironmentSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     name: str
-    task_seed: int = Field(ge=0)
+    task_seed: int = Field(default=1337, ge=0)
     tasks: int = Field(ge=3)
     train: int = Field(ge=2)
     horizon: int = Field(ge=1)

@@ -177,6 +177,12 @@ def validate_table(
         raise error(f"{place}: {first_problem(problem, kind=kind, table=table)}") from None
 
 
+def missing_fields(kind: type[BaseModel], values: Mapping[str, Any], *, table: str) -> list[str]:
+    """The fields of a settings class that have no default and no value, by dotted names."""
+    fields = {field.alias or name: field for name, field in kind.model_fields.items()}
+    return [f"{table}.{name}" for name, field in fields.items() if field.is_required() and name not in values]
+
+
 def first_problem(error: ValidationError, *, kind: type[BaseModel] | None = None, table: str = "") -> str:
     """The first problem of a validation error in one line: field, rule, value.
 

@@ -12,8 +12,7 @@ from tcmrl_data.foundation.records import nearest
 from tcmrl_data.recipe.profile import PROFILES, Profile
 
 RECIPE_SCHEMA = 1
-REQUIRED_TABLES = ("about", "behavior", "environment", "rollouts")
-TABLES = sorted([*REQUIRED_TABLES, "build", "training"])
+TABLES = ("about", "behavior", "build", "environment", "rollouts", "training")
 SUFFIX = ".toml"
 """Ending of a recipe file's name, and of no environment's name."""
 
@@ -46,8 +45,10 @@ class RecipeDocument:
     def tables(self, profile: Profile, overrides: Sequence[str] = ()) -> dict[str, Any]:
         """The document's tables, overridden by the variant, then the profile, then the overrides.
 
+        Tables that it lacks are empty.
+
         Raises:
-            RecipeError: the profile or a required table is missing, a table is unknown, a value stands where
+            RecipeError: the profile is missing, a table is unknown, a value stands where
                 a table should be, or an override is invalid (see `apply_overrides`).
         """
         if profile not in self.profiles:
@@ -65,10 +66,7 @@ class RecipeDocument:
                 raise RecipeError(f"{place}: unknown table {name!r}; {nearest(name, TABLES)}")
             if not isinstance(table, Mapping):
                 raise RecipeError(f"{place}: {name} is a value; write it as a table [{name}]")
-        for name in REQUIRED_TABLES:
-            if name not in tables:
-                raise RecipeError(f"{place} lacks the table [{name}]; add it")
-        return tables
+        return {name: tables.get(name, {}) for name in TABLES}
 
 
 def open_recipe(name_or_file: str | Path) -> RecipeDocument:

@@ -12,7 +12,7 @@ from tcmrl_data.envs.base import ENVIRONMENTS, Environment, Reward, TaskSplit, m
 from tcmrl_data.envs.controller import View
 from tcmrl_data.envs.foreign import Foreign
 from tcmrl_data.foundation.errors import RecipeError, TcmrlError
-from tcmrl_data.foundation.records import as_model, validate_table
+from tcmrl_data.foundation.records import as_model, missing_fields, validate_table
 from tcmrl_data.recipe.about import About, licence_problem, read_about
 from tcmrl_data.recipe.document import merge_tables, open_recipe, read_override
 from tcmrl_data.recipe.profile import Profile
@@ -39,6 +39,10 @@ class Rollouts(_Table):
         if self.episodes % self.lanes:
             raise ValueError(f"episodes ({self.episodes}) must be a multiple of lanes ({self.lanes})")
         return self
+
+
+ROLLOUTS = {"episodes": 50, "lanes": 10}
+"""What a recipe file need not say: the paper's number of episodes (Appendix F.1)."""
 
 
 class NoRollouts(Rollouts):
@@ -174,17 +178,27 @@ def load_recipe(
     validated = functools.partial(validate_table, place=place, error=RecipeError)
     kind = ENVIRONMENTS.get(document.environment)
     named = tables["environment"] | {"name": document.environment}
+    own, source, settings = _behavior(tables["behavior"], place)
+    table = f"behavior.{own.source}"
+    lacking = [
+        *missing_fields(About, tables["about"], table="about"),
+        *missing_fields(kind.Settings, named, table="environment"),
+        *missing_fields(source.Settings, settings, table=table),
+    ]
+    if lacking:
+        raise RecipeError(f"{place} lacks {', '.join(lacking)}; add {'them' if lacking[1:] else 'it'}")
     environment = validated(kind.Settings, named, table="environment")
     kind(environment)  # refuses settings that the family as a whole does not allow
-    training = {name: document.tables(name).get("training", {}) for name in document.profiles}
+    full = validated(source.Settings, settings, table=table).model_dump(mode="json")
     return Recipe(
         profile=profile,
         about=read_about(tables["about"], place),
         environment=EnvironmentTable.model_validate(environment.model_dump(mode="json")),
-        behavior=_behavior_table(tables["behavior"], place),
-        rollouts=validated(Rollouts, tables["rollouts"], table="rollouts"),
-        build=validated(TaskChoice, tables.get("build", {}), table="build"),
-        training=training | {profile: tables.get("training", {})},
+        behavior=BehaviorTable(**own.model_dump(), settings=full),
+        rollouts=validated(Rollouts, ROLLOUTS | tables["rollouts"], table="rollouts"),
+        build=validated(TaskChoice, tables["build"], table="build"),
+        training={name: document.tables(name)["training"] for name in document.profiles}
+        | {profile: tables["training"]},
     )
 
 
@@ -233,23 +247,22 @@ def _check_overrides(overrides: Sequence[str]) -> None:
 class _Behavior(_Table):
     """The `[behavior]` table of a recipe file, without the tables of sources."""
 
-    source: str
+    source: str = "stacked"
     observation: View = "stored"
     reward: Reward = "stored"
 
 
-def _behavior_table(tables: Mapping[str, Any], place: str) -> BehaviorTable:
-    """`[behavior]` with the settings of its source, whose table overrides that of the source it extends."""
+def _behavior(
+    tables: Mapping[str, Any], place: str
+) -> tuple[_Behavior, type[BehaviorSource], dict[str, Any]]:
+    """`[behavior]`, its source, and the source's table on top of that of the source that it extends."""
     plain = {key: value for key, value in tables.items() if not isinstance(value, Mapping)}
     own = validate_table(_Behavior, plain, place=place, error=RecipeError, table="behavior")
     kind = BEHAVIOR_SOURCES.get(own.source)
-    table = f"behavior.{own.source}"
     if not isinstance(tables.get(own.source), Mapping):
-        raise RecipeError(f"{place}: behavior source {own.source!r} has no [{table}] table")
+        raise RecipeError(f"{place}: behavior source {own.source!r} has no [behavior.{own.source}] table")
     extended = tables.get(kind.extends or own.source, {})
-    values = merge_tables(extended if isinstance(extended, Mapping) else {}, tables[own.source])
-    settings = validate_table(kind.Settings, values, place=place, error=RecipeError, table=table)
-    return BehaviorTable(**own.model_dump(), settings=settings.model_dump(mode="json"))
+    return own, kind, merge_tables(extended if isinstance(extended, Mapping) else {}, tables[own.source])
 
 
 UNKNOWN = "unknown"

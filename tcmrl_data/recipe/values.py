@@ -55,7 +55,7 @@ def recipe_values(
     recipe = load_recipe(name_or_file, profile=profile, overrides=overrides)
     sources = _sources(document, profile, overrides)
     tables = document.tables(profile, overrides)
-    written = dict(leaves(tables))
+    written = dict(leaves({name: table for name, table in tables.items() if table}))
     own = recipe.behavior.source
     extended = ("behavior", BEHAVIOR_SOURCES.get(own).extends or own)
     known = {*written, *(("behavior", own, *path[2:]) for path in written if path[:2] == extended)}
