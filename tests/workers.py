@@ -16,7 +16,7 @@ MARK = "TCMRL_TEST_MARK"
 ROOT = Path(__file__).parents[1]
 PATIENCE = 240.0
 """Seconds after which what is waited for counts as hanging; nothing depends on how long it takes."""
-WORKERS = (b"tcmrl_data.building.worker", b"tests.directed")
+WORKERS = (b"tcmrl_data.building.unit", b"tests.directed")
 
 
 def worker_pids(mark: str) -> list[int]:

@@ -167,7 +167,7 @@ def _check_space(out: Path, needed: int, num_parts: int) -> None:
         )
 
 
-WORKER = "tcmrl_data.building.worker"
+WORKER = "tcmrl_data.building.unit"
 """Module that does a unit."""
 
 

@@ -1,6 +1,6 @@
 """What one worker does: train a unit's behavior policies, roll them out, publish the parts. Idempotent.
 
-The process of a unit is `python -m tcmrl_data.building.worker`.
+The process of a unit is `python -m tcmrl_data.building.unit`, with a JSON spec on its input.
 """
 
 import contextlib
@@ -14,7 +14,7 @@ from tcmrl_data.behavior.checkpoints import CHECKPOINT_SECONDS, CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.work_files import checkpoint_name
-from tcmrl_data.engine.worker import Send
+from tcmrl_data.engine.worker import Send, serve
 from tcmrl_data.envs.tasks import Task
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.errors import NondeterminismError
@@ -210,3 +210,15 @@ def _checkpoints(
         seconds=spec.checkpoint_seconds,
         warn=lambda message: report({"kind": "warning", "message": message}),
     )
+
+
+def work(spec: dict[str, Any], report: Send) -> str:
+    """Makes and publishes the parts of a unit; the digest of their ids."""
+    import torch
+
+    torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently
+    return run_unit(UnitSpec.from_json(spec), report)
+
+
+if __name__ == "__main__":
+    serve(work)
