@@ -226,7 +226,7 @@ def test_a_damaged_checkpoint_is_ignored(saved: Callable[[], Path]) -> None:
     assert folder(dataset).load() is None
 
 
-STEPS = 3_000
+STEPS = 1_500
 LONG = (
     *TINY,
     f"behavior.sac.steps={STEPS}",
@@ -265,7 +265,7 @@ def test_a_build_killed_after_every_second_checkpoint_ends_in_the_same_parts(
     long_ids: dict[tuple[int, int], str], mark: str, tmp_path: Path
 ) -> None:
     out, kept = tmp_path / "data", [0]
-    for _ in range(3):
+    for _ in range(2):
         with command_line(*long_build(out, 0)) as driver:
             seen = {kept[-1]}
 

@@ -138,11 +138,11 @@ def work(spec: dict[str, Any], report: Send) -> str:
     sees = wait_until_visible(Path(spec["token"]), deadline=spec["deadline"])
     report({"kind": "node", "sees_folder": sees, "tcmrl": version("tcmrl")})
     if sees and version("tcmrl") == spec["tcmrl"]:
-        report({"kind": "platform", "platform": _platform(spec["recipe"])})
+        report({"kind": "platform", "platform": _own_platform(spec["recipe"])})
     return ""
 
 
-def _platform(recipe: dict[str, Any]) -> dict[str, Any]:
+def _own_platform(recipe: dict[str, Any]) -> dict[str, Any]:
     from tcmrl_data.recipe.recipe import Recipe
     from tcmrl_data.store.platform import this_platform
 
