@@ -1,10 +1,11 @@
 """The card of a dataset: a README with front matter for hubs, made of what the dataset says of itself."""
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import fmean
 from typing import Any
 
+import jinja2
 import numpy as np
 import yaml
 
@@ -65,27 +66,46 @@ def _kept_text(file: Path) -> str:
 
 
 def dataset_card(dataset: Dataset, *, kept: str = "") -> str:
-    """The card as Markdown.
+    """The card as Markdown, by the template `card.md.jinja`.
 
     Args:
         dataset: the dataset or view.
         kept: Markdown of people, which stands below the summary between the marks.
     """
-    summary, quality = dataset_summary(dataset), measure_quality(dataset)
-    sections = [
-        f"---\n{yaml.safe_dump(_front_matter(dataset, summary), sort_keys=False, allow_unicode=True)}---",
-        f"# {_plain(dataset.manifest.label or dataset.name)}",
-        _plain(summary["description"]),
-        "\n".join(filter(None, [BEGIN, kept, END])),
-        *_what_it_is(summary),
-        *_how_it_was_made(dataset, summary),
-        *_returns(dataset, quality),
-        *_tiers(quality),
-        *_how_to_use(dataset),
-        *_limits(dataset, summary),
-        *_licence_and_citation(dataset),
-    ]
-    return "\n\n".join(sections) + "\n"
+    manifest, summary, quality = dataset.manifest, dataset_summary(dataset), measure_quality(dataset)
+    front_matter = _front_matter(dataset, summary)
+    spreads = {(stage.step, stage.split): stage.tq for stage in quality.stages}
+    returns = summarize_returns(return_table(dataset))
+    for row in returns:
+        spread = spreads.get((row["step"], row["split"]))
+        row["tq"] = None if spread is None else spread.iqm
+    words = {"cpu": "CPU", "system": "system", "python": "Python", "packages": "packages"}
+    made_with = [(word, "; ".join(summary["made_with"][name])) for name, word in words.items()]
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent),
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        keep_trailing_newline=True,
+    )
+    environment.filters |= {"plain": _plain, "number": _number, "whole": "{:,}".format}
+    return environment.get_template("card.md.jinja").render(
+        front_matter=yaml.safe_dump(front_matter, sort_keys=False, allow_unicode=True),
+        title=manifest.label or dataset.name,
+        manifest=manifest,
+        summary=summary,
+        begin=BEGIN,
+        kept=kept,
+        end=END,
+        size=size(summary["bytes"]),
+        made_with=[(word, value) for word, value in made_with if value],
+        returns=returns,
+        tiers=list(tier_rows(quality)),
+        task=(dataset.train_tasks or dataset.tasks)[0].index if dataset.tasks else 0,
+        build_command=_build_command(dataset),
+        limits=_limits(dataset, summary),
+        bibtex=citation_text(manifest, "bibtex").rstrip().replace("```", ""),
+    )
 
 
 def _front_matter(dataset: Dataset, summary: dict[str, Any]) -> dict[str, Any]:
@@ -113,84 +133,6 @@ def _size_category(steps: int) -> str:
     return f"{bounds[place - 1]}<n<{bounds[place]}"
 
 
-def _what_it_is(summary: dict[str, Any]) -> Iterator[str]:
-    steps = ", ".join(f"{step:,}" for step in summary["snapshots"])
-    yield "## What it is"
-    yield (
-        "A dataset for offline meta-reinforcement learning: policies of many tasks of one environment, kept "
-        "at several steps of their training, and episodes that they played. A policy with its episodes is a "
-        "*part*."
-    )
-    rows = {
-        "environment": _plain(summary["name"]),
-        "tasks": f"{summary['tasks']:,} ({summary['train']:,} training, {summary['test']:,} test)",
-        "snapshots": f"steps {steps}",
-        "parts": f"{summary['parts']:,} of {summary['parts_total']:,}",
-        "episodes": f"{summary['episodes']:,} with {summary['steps']:,} steps",
-        "size": size(summary["bytes"]),
-        "root": f"`{summary['root']}`",
-    }
-    yield _table(["", ""], rows.items())
-
-
-def _how_it_was_made(dataset: Dataset, summary: dict[str, Any]) -> Iterator[str]:
-    manifest = dataset.manifest
-    yield "## How it was made"
-    rows = [
-        (
-            run.name,
-            run.kind,
-            "–" if run.recipe is None else _plain(run.recipe.behavior.source),
-            "–" if run.seed is None else str(run.seed),
-        )
-        for run in manifest.runs
-    ]
-    yield _table(["run", "kind", "behavior policies", "seed"], rows)
-    if manifest.derivation is not None:
-        made = manifest.derivation
-        roots = ", ".join(f"`{source.root[:12]}`" for source in made.sources)
-        yield f"Made by `{made.operation}`{f' from datasets with the roots {roots}' if roots else ''}."
-    made_with = summary["made_with"]
-    lines = [
-        f"- {name}: {_plain('; '.join(made_with[key]))}"
-        for name, key in (
-            ("CPU", "cpu"),
-            ("system", "system"),
-            ("Python", "python"),
-            ("packages", "packages"),
-        )
-        if made_with[key]
-    ]
-    yield "\n".join(lines) if lines else "The software and hardware that made it are not known."
-
-
-def _returns(dataset: Dataset, quality: Quality) -> Iterator[str]:
-    yield "## Returns"
-    yield (
-        "Mean undiscounted return of a task, over tasks. Trajectory quality (TQ) is the interquartile mean "
-        "over tasks of the return, where 0 is that of uniform actions and 1 the best that is known of the "
-        "task ([Schweighofer et al., 2021](https://arxiv.org/abs/2111.04714))."
-    )
-    tq = {(stage.step, stage.split): stage.tq for stage in quality.stages}
-    rows = []
-    for row in summarize_returns(return_table(dataset)):
-        spread = tq.get((row["step"], row["split"]))
-        numbers = [_number(row[name]) for name in ("mean", "std", "min", "max")]
-        found = _number(None if spread is None else spread.iqm)
-        rows.append((f"{row['step']:,}", row["split"], str(row["tasks"]), *numbers, found))
-    yield _table(["step", "split", "tasks", "mean", "std", "min", "max", "TQ"], rows)
-
-
-def _tiers(quality: Quality) -> Iterator[str]:
-    yield "## Tiers"
-    yield "Quality tiers by D4RL's words; `tcmrl-data derive DATASET --tier NAME --out FOLDER` makes one."
-    rows = [
-        (f"`{tier}`", f"{tasks:,} of {len(quality.tasks):,}", f"{parts:,}", _number(tq))
-        for tier, tasks, parts, _, tq in tier_rows(quality)
-    ]
-    yield _table(["tier", "tasks", "parts", "mean TQ"], rows)
-
-
 def tier_rows(quality: Quality) -> Iterator[tuple[str, int, int, int, float | None]]:
     """Of every tier: its name, the tasks that have it, their parts and episodes, and the parts' mean TQ.
 
@@ -202,25 +144,6 @@ def tier_rows(quality: Quality) -> Iterator[tuple[str, int, int, int, float | No
         episodes = sum(part.episodes for _, part in taken)
         mean = fmean(known) if known and len(known) == len(taken) else None
         yield tier, len({task for task, _ in taken}), len(taken), episodes, mean
-
-
-def _how_to_use(dataset: Dataset) -> Iterator[str]:
-    task = (dataset.train_tasks or dataset.tasks)[0].index if dataset.tasks else 0
-    yield "## How to load it"
-    yield (
-        "```python\n"
-        "import tcmrl_data\n\n"
-        'dataset = tcmrl_data.open_dataset("FOLDER")\n'
-        f'episodes = dataset.select(snapshots="last").trajectories({task})\n'
-        "observations, actions = episodes[0].observations, episodes[0].actions\n"
-        "```"
-    )
-    yield "`tcmrl-data verify FOLDER` checks every file; no code of the dataset runs when it is read."
-    command = _build_command(dataset)
-    if command is not None:
-        yield "## How to build it again"
-        yield f"```bash\n{command}\n```"
-        yield f"gives the root `{dataset.manifest.root[:12]}` on an equal platform."
 
 
 def _build_command(dataset: Dataset) -> str | None:
@@ -239,7 +162,7 @@ def _build_command(dataset: Dataset) -> str | None:
     return f"tcmrl-data build {manifest.name} --profile {manifest.profile} --seed {manifest.seed}{limit}"
 
 
-def _limits(dataset: Dataset, summary: dict[str, Any]) -> Iterator[str]:
+def _limits(dataset: Dataset, summary: dict[str, Any]) -> list[str]:
     runs, columns = dataset.manifest.runs, dataset.parts.columns
     is_unknown = {name: np.isnan(columns[name]) for name in REFERENCES}
     no_expert = is_unknown["oracle"] & is_unknown["scripted"]
@@ -257,26 +180,7 @@ def _limits(dataset: Dataset, summary: dict[str, Any]) -> Iterator[str]:
         "No controller knows some tasks; their scores compare with the best policy.": bool(no_expert.any()),
         "Parameters of some tasks are not known.": any(not task.parameters for task in dataset.tasks),
     }
-    yield "## Known limits"
-    lines = [f"- {text}" for text, holds in found.items() if holds]
-    yield "\n".join([*lines, "- Episodes are of simulations; other processors round differently."])
-
-
-def _licence_and_citation(dataset: Dataset) -> Iterator[str]:
-    licences = [_plain(name) for name in dataset.manifest.licences]
-    yield "## Licence"
-    if len(licences) == 1:
-        yield f"{licences[0]}."
-    else:
-        yield f"Its sources are under different licences, all of which apply: {', '.join(licences)}."
-    yield "## Citation"
-    yield f"{_plain(dataset.manifest.recipe.about.citation)}."
-    yield f"```bibtex\n{citation_text(dataset.manifest, 'bibtex').rstrip().replace('```', '')}\n```"
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    return [text for text, holds in found.items() if holds]
 
 
 def _plain(text: str) -> str:

@@ -35,10 +35,9 @@ class Citation:
     """A dataset as a work to be cited, and the works to be cited with it.
 
     Attributes:
-        name: of the environment or the dataset, for the key of its entry.
         version: the first twelve digits of the dataset's root: equal data, equal version.
         licences: all that the data are under.
-        software: version of this package, which reads the data.
+        software: version of this package.
     """
 
     name: str

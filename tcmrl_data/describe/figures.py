@@ -15,6 +15,7 @@ from tcmrl_data.dataset.returns import SPLITS, summarize_returns
 from tcmrl_data.describe.measures import ACTION_BINS, BROWSED_COLUMNS, Browsed, Content
 from tcmrl_data.foundation.seeding import evenly_spread
 from tcmrl_data.page.page import escaped
+from tcmrl_data.quality.measured import STEPS_LABEL, TICKS
 from tcmrl_data.quality.transfer import Transfer
 from tcmrl_data.store.keys import MAIN_RUN, PartKey
 
@@ -24,12 +25,9 @@ COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#44
 GRAY = 6
 """Index of the palette's dark gray, for references."""
 
-STEPS = "environment steps of behavior training"
-MOST_TICKS = 20
-
 Values = npt.NDArray[Any]
 Axis = dict[str, Any]
-Frame = tuple[str, Sequence[Any]]
+SliderFrame = tuple[str, Sequence[Any]]
 """A place of a slider in words, and the traces of plotly that are shown there."""
 
 
@@ -48,7 +46,7 @@ class ReportFigure:
     name: str
     caption: str
     layout: dict[str, Any]
-    frames: Sequence[Frame]
+    frames: Sequence[SliderFrame]
     slider: str = ""
     starts_last: bool = False
 
@@ -94,7 +92,7 @@ def learning_curves(content: Content) -> ReportFigure:
         "A thin line is a task. Click on an entry of the legend to hide its lines, and again to show them; "
         "point at a line to see which task it is."
     )
-    layout = _layout(_axis(STEPS), _axis("mean undiscounted return"), height=460)
+    layout = _layout(_axis(STEPS_LABEL), _axis("mean undiscounted return"), height=460)
     return ReportFigure("learning-curves", caption, layout, [("", lines)])
 
 
@@ -259,7 +257,7 @@ def scores(content: Content) -> ReportFigure:
         "A row is a task, from bottom to top in the order of their indices."
     )
     x, y = (
-        _axis(STEPS, ticks=[f"{step:,}" for step in steps]),
+        _axis(STEPS_LABEL, ticks=[f"{step:,}" for step in steps]),
         _axis("task", ticks=[row.task for row in rows]),
     )
     frame = ("", [_heat_map(cells, "TQ", low=0.0, high=1.0)])
@@ -275,14 +273,16 @@ def coverage(content: Content) -> ReportFigure:
         "quality. Means over tasks."
     )
     lines = _stage_lines(found.stages, saco="coverage", tq="TQ")
-    return ReportFigure("coverage", caption, _layout(_axis(STEPS), _axis("share"), height=360), [("", lines)])
+    return ReportFigure(
+        "coverage", caption, _layout(_axis(STEPS_LABEL), _axis("share"), height=360), [("", lines)]
+    )
 
 
 def silence(content: Content) -> ReportFigure:
     """Share of zero rewards and of episodes without any reward, by snapshot."""
     caption = "A task whose rewards are all zero cannot be told from others by its rewards. Means over parts."
     lines = _stage_lines(content.rewards.stages, zero="zero rewards", silent="episodes without reward")
-    layout = _layout(_axis(STEPS), _axis("share", -0.03, 1.03), height=340)
+    layout = _layout(_axis(STEPS_LABEL), _axis("share", -0.03, 1.03), height=340)
     return ReportFigure("silence", caption, layout, [("", lines)])
 
 
@@ -434,7 +434,7 @@ def _heat_map(
 def _axis(
     label: str, low: float | None = None, high: float | None = None, *, ticks: Sequence[Any] | None = None
 ) -> Axis:
-    """An axis; of the names `ticks` of rows or columns 0, 1, … at most MOST_TICKS are written."""
+    """An axis; of the names `ticks` of rows or columns 0, 1, … at most TICKS are written."""
     axis: Axis = {
         "title": {"text": _text(label)},
         "automargin": True,
@@ -444,7 +444,7 @@ def _axis(
     if low is not None and high is not None:
         axis["range"] = [float(low), float(high)]
     if ticks is not None:
-        places = evenly_spread(range(len(ticks)), MOST_TICKS)
+        places = evenly_spread(range(len(ticks)), TICKS)
         axis |= {"tickvals": places, "ticktext": [_text(str(ticks[place])) for place in places]}
     return axis
 
@@ -470,7 +470,7 @@ def _layout(x: Axis, *y: Axis, height: int, is_square: bool = False) -> dict[str
         "hovermode": "closest",
         "showlegend": True,
         "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom", "font": {"size": 12}},
-        "plot_bgcolor": "#fafafa",
+        "plot_bgcolor": "#ffffff",
         "font": {"family": "system-ui, sans-serif", "size": 13, "color": "#222222"},
     }
 

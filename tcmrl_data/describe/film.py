@@ -61,13 +61,7 @@ def find_episode(dataset: Dataset, key: PartKey, number: int) -> StoredEpisode:
 
 @dataclass(frozen=True)
 class Frame:
-    """A picture of an episode.
-
-    Attributes:
-        picture: (height, width, 3).
-        steps: done before it was taken.
-        reward: sum of the rewards of these steps.
-    """
+    """A picture (height, width, 3) of an episode, and the steps before it with the sum of their rewards."""
 
     picture: Picture
     steps: int

@@ -24,8 +24,8 @@ from tcmrl_data.store.keys import PartKey
 SHOWN_TASKS = 100
 """Tasks with a map of visits, paths and a learning curve; of more tasks, evenly chosen ones."""
 
-SAMPLED_PARTS = 64
-"""Parts that the plane and its borders are computed from, evenly spread over the dataset's."""
+SAMPLED_PARTS, SAMPLED_STATES = 64, 2_000
+"""Parts, and states of each, that the plane and its borders are computed from, evenly spread."""
 
 BORDER = 0.05
 """What the plane shows around the sampled states, as a share of their range."""
@@ -45,8 +45,8 @@ PATHS, PATH_POINTS = 3, 40
 BROWSED_STEPS, BROWSED_COLUMNS = 400, 8
 """Steps of a browsed episode, and columns of its observations and of its actions, that are drawn."""
 
-Counts = npt.NDArray[np.int64]
-Episodes = Sequence[Trajectory]
+_Counts = npt.NDArray[np.int64]
+_Episodes = Sequence[Trajectory]
 StageProgress = Callable[[str, int, int], None]
 
 
@@ -190,10 +190,11 @@ def choose_plane(dataset: Dataset, keys: Sequence[PartKey]) -> Plane:
 
     Args:
         dataset: the dataset.
-        keys: of its parts, at least one; some are read, one after another.
+        keys: of its parts, at least one; some rows of some are read.
     """
-    sample = evenly_spread(keys, SAMPLED_PARTS)
-    width = _observations(dataset, sample[0]).shape[1]
+    states = np.concatenate([_sampled_states(dataset, key) for key in evenly_spread(keys, SAMPLED_PARTS)])
+    width = states.shape[1]
+    states = states[np.isfinite(states).all(axis=1)]
     try:
         named = dataset.environment.plane
     except TcmrlError:  # the environment is not installed
@@ -201,45 +202,31 @@ def choose_plane(dataset: Dataset, keys: Sequence[PartKey]) -> Plane:
     matrix: FloatArray = np.eye(width, 2)
     center: FloatArray = np.zeros(width)
     names, explained = named or ("first principal component", "second principal component"), None
-    if named is None or width < 2:
-        matrix, center, explained = _principal_components(dataset, sample, width)
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for key in sample:
-        points = (_observations(dataset, key) - center) @ matrix
-        finite = points[np.isfinite(points).all(axis=1)]
-        if len(finite):
-            low, high = np.minimum(low, finite.min(axis=0)), np.maximum(high, finite.max(axis=0))
-    low, high = np.where(low <= high, low, 0.0), np.where(low <= high, high, 0.0)
+    if (named is None or width < 2) and len(states) > 1:
+        matrix, center, explained = _principal_components(states)
+    points = (states - center) @ matrix
+    low, high = (points.min(axis=0), points.max(axis=0)) if len(points) else (np.zeros(2), np.zeros(2))
     room = np.where(high > low, BORDER * (high - low), 1.0)
     return Plane(names, matrix, center, low - room, high + room, explained)
 
 
-def _observations(dataset: Dataset, key: PartKey) -> FloatArray:
-    found: FloatArray = dataset.arrays(*key, names=["observations"])["observations"].astype(np.float64)
+def _sampled_states(dataset: Dataset, key: PartKey) -> FloatArray:
+    rows = dataset.arrays(*key, names=["observations"])["observations"]
+    found: FloatArray = rows[evenly_spread(range(len(rows)), SAMPLED_STATES)].astype(np.float64)
     return found
 
 
-def _principal_components(
-    dataset: Dataset, sample: Sequence[PartKey], width: int
-) -> tuple[FloatArray, FloatArray, float]:
-    """Matrix, center and share of the variance of two principal components of standardized observations."""
-    count, total, products = 0, np.zeros(width), np.zeros((width, width))
-    for key in sample:
-        rows = _observations(dataset, key)
-        count += len(rows)
-        total += rows.sum(axis=0)
-        products += rows.T @ rows
-    mean = total / max(count, 1)
-    covariance = products / max(count, 1) - np.outer(mean, mean)
-    deviation = np.sqrt(np.clip(np.diag(covariance), 0.0, None))
-    scale = np.divide(1.0, deviation, out=np.zeros(width), where=deviation > 1e-6 * (1.0 + np.abs(mean)))
-    values, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
-    chosen = vectors[:, ::-1][:, :2]
-    # The sign of an eigenvector is arbitrary: its largest entry becomes positive.
-    chosen = chosen * np.sign(chosen[np.abs(chosen).argmax(axis=0), range(chosen.shape[1])])
-    matrix = np.zeros((width, 2))
-    matrix[:, : chosen.shape[1]] = scale[:, None] * chosen
-    return matrix, mean, float(values[::-1][:2].sum() / max(values.sum(), 1e-12))
+def _principal_components(states: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+    """Matrix, center and share of the variance of two principal components of standardized states."""
+    from sklearn.decomposition import PCA
+    from sklearn.preprocessing import StandardScaler
+
+    scaler = StandardScaler().fit(states)
+    with np.errstate(invalid="ignore"):  # of states that do not vary
+        found = PCA(min(2, *states.shape)).fit(scaler.transform(states))
+    matrix = np.zeros((states.shape[1], 2))
+    matrix[:, : len(found.components_)] = (found.components_ / scaler.scale_).T
+    return matrix, scaler.mean_, float(np.nan_to_num(found.explained_variance_ratio_).sum())
 
 
 @final
@@ -254,10 +241,10 @@ class StateVisits:
 
     def __init__(self, plane: Plane, tasks: Sequence[int]) -> None:
         self._plane = plane
-        self.counts: dict[int, Counts] = {task: np.zeros((BINS, BINS), np.int64) for task in tasks}
+        self.counts: dict[int, _Counts] = {task: np.zeros((BINS, BINS), np.int64) for task in tasks}
         self.outside = self.total = 0
 
-    def add(self, key: PartKey, episodes: Episodes) -> None:
+    def add(self, key: PartKey, episodes: _Episodes) -> None:
         """Counts a part in."""
         if key.task not in self.counts:
             return
@@ -281,10 +268,10 @@ class ActionCounts:
     """
 
     def __init__(self) -> None:
-        self.counts: dict[int, Counts] = {}
+        self.counts: dict[int, _Counts] = {}
         self.saturated: dict[int, int] = {}
 
-    def add(self, key: PartKey, episodes: Episodes) -> None:
+    def add(self, key: PartKey, episodes: _Episodes) -> None:
         """Counts a part in."""
         actions = np.concatenate([episode.actions for episode in episodes])
         columns = actions.shape[1]
@@ -319,7 +306,7 @@ class StepEndings:
     shortest: int = np.iinfo(np.int64).max
     longest: int = 0
     steps: int = 0
-    returns: Counts = field(default_factory=lambda: np.zeros(RETURN_BINS, np.int64))
+    returns: _Counts = field(default_factory=lambda: np.zeros(RETURN_BINS, np.int64))
 
 
 @final
@@ -339,7 +326,7 @@ class EpisodeCounts:
         self.edges: FloatArray = np.linspace(low, high if high > low else low + 1.0, RETURN_BINS + 1)
         self.by_step: dict[int, StepEndings] = {}
 
-    def add(self, key: PartKey, episodes: Episodes) -> None:
+    def add(self, key: PartKey, episodes: _Episodes) -> None:
         """Counts a part in."""
         found = self.by_step.setdefault(key.step, StepEndings())
         lengths = [len(episode) for episode in episodes]
@@ -365,7 +352,7 @@ class Paths:
         self._plane, self._keys = plane, frozenset(keys)
         self.found: dict[PartKey, FloatArray] = {}
 
-    def add(self, key: PartKey, episodes: Episodes) -> None:
+    def add(self, key: PartKey, episodes: _Episodes) -> None:
         """Keeps the paths of a chosen part."""
         if key not in self._keys:
             return
@@ -405,7 +392,7 @@ class Browsed:
     columns: tuple[int, int]
 
 
-def _browsed(key: PartKey, number: int, episodes: Episodes) -> Browsed:
+def _browsed(key: PartKey, number: int, episodes: _Episodes) -> Browsed:
     episode = episodes[number]
     rows = np.array(evenly_spread(range(len(episode)), BROWSED_STEPS), np.int64)
     cut = "truncated" if episode.truncated.any() else "cut"

@@ -53,16 +53,7 @@ INK = (40, 40, 40)
 
 @dataclass(frozen=True)
 class Rendered:
-    """What was drawn.
-
-    Attributes:
-        file: that was written.
-        task, step, run, episode: the episode.
-        steps: its length.
-        reward: its undiscounted return.
-        frames: number of pictures in the file.
-        bytes: size of the file.
-    """
+    """The file that was written, and the episode that it shows; `reward` is its undiscounted return."""
 
     file: Path
     task: int
@@ -278,11 +269,6 @@ def _still(frame: Frame) -> Picture:
 
 
 def _check_ending(file: Path) -> None:
-    """Refuses names of files that cannot be written.
-
-    Raises:
-        RenderingError: another ending, or an MP4 without the program ffmpeg.
-    """
     if file.suffix.lower() not in ENDINGS:
         raise RenderingError(f"--out {file}: the name must end in {', '.join(ENDINGS)}")
     if file.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
@@ -358,13 +344,7 @@ def _mp4(pictures: Sequence[Picture], shown: int) -> bytes:
 
 
 def _line_of_words(text: str, width: int, height: int) -> Picture:
-    """A line of words on white, in letters that are small enough for it.
-
-    Args:
-        text: the words.
-        width: in pixels.
-        height: in pixels.
-    """
+    """A line of words on white, in letters that are small enough for it."""
     from PIL import Image, ImageDraw
 
     image = Image.new("RGB", (width, height), "white")

@@ -27,12 +27,9 @@ SHIFT_NOTED = 0.5
 
 @dataclass(frozen=True)
 class Verdict:
-    """A statement about a dataset.
+    """A statement about a dataset, with the numbers that it follows from.
 
-    Attributes:
-        tone: whether it speaks for the dataset, asks for attention, or is a fact.
-        statement: in a few words.
-        evidence: the numbers, and how to read them.
+    The tone says whether it speaks for the dataset, asks for attention, or is a fact.
     """
 
     tone: Tone
