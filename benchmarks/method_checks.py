@@ -34,9 +34,9 @@ from torch import Tensor
 
 from tcmrl_algo import Algorithm, ContextAlgorithm, create_algorithm
 from tcmrl_algo.adaptation.arena import Arena, Context
-from tcmrl_algo.algorithms.borel.borel import BorelLearner, joined_episodes
+from tcmrl_algo.algorithms.borel import BorelLearner, joined_episodes
 from tcmrl_algo.algorithms.csro import CsroLearner
-from tcmrl_algo.algorithms.macaw.macaw import MacawLearner
+from tcmrl_algo.algorithms.macaw import MacawLearner
 from tcmrl_algo.algorithms.unicorn import UnicornLearner
 from tcmrl_algo.reporting.contexts import NUM_TASKS, centroid_accuracy
 from tcmrl_algo.reporting.sources import FinishedRun, read_sources

@@ -17,10 +17,8 @@ from torch.nn import functional
 
 import tcmrl_algo
 import tcmrl_data
-from tcmrl_algo.algorithms.tcmrl import TcmrlLearner
-from tcmrl_algo.losses import context as losses
-from tcmrl_algo.networks.attention import mean_representation
-from tcmrl_algo.networks.perceptron import call_frozen
+from tcmrl_algo.algorithms.core.networks import call_frozen, mean_representation
+from tcmrl_algo.algorithms.tcmrl import TcmrlLearner, negative_reward_loss, reverse_context
 from tcmrl_data import Batch, Steps
 
 
@@ -43,19 +41,17 @@ def distance_from_mean(learner: TcmrlLearner, steps: Steps) -> dict[str, float]:
         found = learner.attention(steps)
         mean = mean_representation(found.representations, found.mask)
         parts = (found.representations, found.weights, found.mask)
-        cosine = functional.cosine_similarity(losses.reverse_context(*parts), mean).min()
-        length = losses.reverse_context(*parts, literal=True).norm(dim=-1) / mean.norm(dim=-1)
+        cosine = functional.cosine_similarity(reverse_context(*parts), mean).min()
+        length = reverse_context(*parts, literal=True).norm(dim=-1) / mean.norm(dim=-1)
     return {"lowest_cosine": round(float(cosine), 6), "undivided_length": round(float(length.mean()), 1)}
 
 
 def negative_loss(learner: TcmrlLearner, batch: Batch, noise: Tensor | float) -> tuple[float, Tensor]:
     """L_neg of a batch under some noise, and its gradient."""
     found, execution = learner.attention(batch["context"]), learner.encoder.read(batch["execution"])
-    reverse = losses.reverse_context(found.representations, found.weights, found.mask)
+    reverse = reverse_context(found.representations, found.weights, found.mask)
     misled = call_frozen(learner.estimator, execution.state_actions.flatten(1, 2), reverse)
-    loss = losses.negative_reward_loss(
-        misled.view(execution.mask.shape), execution.rewards + noise, execution.mask
-    )
+    loss = negative_reward_loss(misled.view(execution.mask.shape), execution.rewards + noise, execution.mask)
     learner.zero_grad()
     loss.backward()  # type: ignore[no-untyped-call]
     gradients = [value.grad for value in learner.parameters() if value.grad is not None]

@@ -21,10 +21,9 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from tcmrl_algo import ContextAlgorithm
-from tcmrl_algo.methods.base import METHODS
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.stages import StagePlan
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.method import METHODS
+from tcmrl_algo.algorithms.core.problem import Problem, StagePlan
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_data import Batch, Steps
 

@@ -7,7 +7,7 @@ import numpy as np
 from torch import Tensor
 
 from tcmrl_algo import Algorithm, Arena, Capabilities, Metrics
-from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.algorithms.core.settings import RunSettings
 from tcmrl_data import Batch, Controller, Dataset, Recorder, Task, Trajectory, Transition
 
 ANGLES = np.linspace(0.0, np.pi, 100)
@@ -42,7 +42,7 @@ class GoalReader(Algorithm):
     def __init__(self) -> None:
         self.seen: list[list[int]] = []
 
-    def update(self, batch: Batch, step: int) -> Metrics:
+    def loss(self, batch: Batch, step: int) -> tuple[Tensor, Metrics]:
         raise AssertionError("never trained")
 
     def adapt(

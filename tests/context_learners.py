@@ -6,9 +6,9 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.methods.base import METHODS
-from tcmrl_algo.methods.stages import StagePlan
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm, ContextLearner, ContextLosses
+from tcmrl_algo.algorithms.core.method import METHODS
+from tcmrl_algo.algorithms.core.problem import StagePlan
 from tcmrl_data import Batch
 from tests.made_up import batch, problem, settings
 

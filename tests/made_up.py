@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.stages import Stage, StagePlan
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.problem import Problem, Stage, StagePlan
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Trajectory, Transitions, Windows
 
 TASKS, EPISODE = 3, 6

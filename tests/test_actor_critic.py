@@ -6,11 +6,10 @@ from types import ModuleType
 import pytest
 import torch
 
-from tcmrl_algo.actor_critic import brac as brac_module
-from tcmrl_algo.actor_critic import sac as sac_module
-from tcmrl_algo.actor_critic.actor_critic import value_bounds
-from tcmrl_algo.actor_critic.sac import SoftActorCritic
-from tcmrl_algo.settings.actor_critic import ActorCriticSettings
+from tcmrl_algo.algorithms.core.actor_critic import sac as sac_module
+from tcmrl_algo.algorithms.core.actor_critic.base import value_bounds
+from tcmrl_algo.algorithms.core.actor_critic.sac import SoftActorCritic
+from tcmrl_algo.algorithms.core.settings import ActorCriticSettings
 from tests.made_up import TASKS, problem, steps
 
 
@@ -95,7 +94,7 @@ def test_value_mode_lowers_each_states_target_by_its_own_divergence(monkeypatch:
 
     spy(sac_module, "value_loss", 1)  # the targets of V
     spy(sac_module, "q_loss", 3)  # V(s'), as Q's targets see it
-    spy(brac_module, "dual_divergence", -1)
+    spy(sac_module, "dual_divergence", -1)
     for mode in ("policy", "value"):
         made = ActorCriticSettings.model_validate({"hidden": (8,), "brac": {"mode": mode, "alpha": 7.0}})
         actor_critic = SoftActorCritic(made, problem(), latent=0, generator=torch.Generator().manual_seed(0))

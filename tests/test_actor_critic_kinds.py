@@ -12,16 +12,15 @@ import torch
 from tcmrl_cli.train import tcmrl
 from torch import Tensor
 
-from tcmrl_algo.actor_critic.actor_critic import ActorCritic, value_bounds
-from tcmrl_algo.actor_critic.bc import BehaviorCloning
-from tcmrl_algo.actor_critic.iql import ImplicitQLearning
-from tcmrl_algo.actor_critic.kinds import KINDS, make_actor_critic
-from tcmrl_algo.actor_critic.rows import ConditionedRows
-from tcmrl_algo.context_methods.learner import ContextAlgorithm
-from tcmrl_algo.losses import actor_critic as losses
-from tcmrl_algo.methods.base import METHODS
-from tcmrl_algo.networks.policy import LIKELIHOOD_LOG_STD, LikelihoodPolicy
-from tcmrl_algo.settings.actor_critic import ActorCriticSettings
+from tcmrl_algo.algorithms.core.actor_critic.base import ActorCritic, ConditionedRows, value_bounds
+from tcmrl_algo.algorithms.core.actor_critic.bc import BehaviorCloning
+from tcmrl_algo.algorithms.core.actor_critic.iql import ImplicitQLearning, advantage_weights, expectile_loss
+from tcmrl_algo.algorithms.core.actor_critic.sac import value_loss
+from tcmrl_algo.algorithms.core.context import KINDS, ContextAlgorithm, make_actor_critic
+from tcmrl_algo.algorithms.core.losses import gaussian_log_likelihood, likelihood_loss
+from tcmrl_algo.algorithms.core.method import METHODS
+from tcmrl_algo.algorithms.core.networks import LIKELIHOOD_LOG_STD, LikelihoodPolicy
+from tcmrl_algo.algorithms.core.settings import ActorCriticSettings
 from tests.commands import in_process
 from tests.made_up import ACTION_DIM, TASKS, problem, steps
 from tests.test_algorithms import LANES, STEPS, Made, act, assert_equal
@@ -58,37 +57,37 @@ def metrics_of(actor_critic: ActorCritic, rows: ConditionedRows) -> dict[str, Te
 
 def test_expectile_loss_weighs_targets_above_by_tau_and_below_by_the_rest() -> None:
     values, targets = torch.tensor([0.0, 2.0, 1.0]), torch.tensor([2.0, 1.0, 1.0])
-    loss = losses.expectile_loss(values, targets, expectile=0.7)
+    loss = expectile_loss(values, targets, expectile=0.7)
     assert loss.item() == pytest.approx((0.7 * 4 + 0.3 * 1 + 0.0) / 3)
-    half = losses.expectile_loss(values, targets, expectile=0.5)
-    assert half.item() == pytest.approx(losses.value_loss(values, targets).item() / 2)
+    half = expectile_loss(values, targets, expectile=0.5)
+    assert half.item() == pytest.approx(value_loss(values, targets).item() / 2)
 
 
 def test_the_expectile_of_two_targets_is_where_its_gradient_vanishes() -> None:
     """With targets 0 and 1: 0.7 (1 - v) = 0.3 v, hence v = 0.7."""
     value = torch.tensor(0.7, requires_grad=True)
-    losses.expectile_loss(value.expand(2), torch.tensor([0.0, 1.0]), expectile=0.7).backward()  # type: ignore[no-untyped-call]
+    expectile_loss(value.expand(2), torch.tensor([0.0, 1.0]), expectile=0.7).backward()  # type: ignore[no-untyped-call]
     assert value.grad is not None
     assert value.grad.item() == pytest.approx(0.0, abs=1e-7)
 
 
 def test_advantage_weights_are_exponential_in_standard_deviations_and_capped() -> None:
     """Advantages -1 and 1 have the unbiased standard deviation sqrt(2)."""
-    found = losses.advantage_weights(torch.tensor([-1.0, 1.0]), inverse_temperature=2.0, largest=100.0)
+    found = advantage_weights(torch.tensor([-1.0, 1.0]), inverse_temperature=2.0, largest=100.0)
     assert found.tolist() == pytest.approx([math.exp(-math.sqrt(2)), math.exp(math.sqrt(2))], rel=1e-5)
-    scaled = losses.advantage_weights(torch.tensor([-50.0, 50.0]), inverse_temperature=2.0, largest=100.0)
+    scaled = advantage_weights(torch.tensor([-50.0, 50.0]), inverse_temperature=2.0, largest=100.0)
     assert scaled.tolist() == pytest.approx(found.tolist(), rel=1e-5)  # the unit of rewards is gone
-    shifted = losses.advantage_weights(torch.tensor([0.0, 2.0]), inverse_temperature=2.0, largest=100.0)
+    shifted = advantage_weights(torch.tensor([0.0, 2.0]), inverse_temperature=2.0, largest=100.0)
     assert shifted.tolist() == pytest.approx([1.0, math.exp(2 * math.sqrt(2))], rel=1e-5)  # not centered
-    capped = losses.advantage_weights(torch.tensor([0.0, 2.0]), inverse_temperature=2.0, largest=3.0)
+    capped = advantage_weights(torch.tensor([0.0, 2.0]), inverse_temperature=2.0, largest=3.0)
     assert capped.tolist() == pytest.approx([1.0, 3.0], rel=1e-5)
-    equal = losses.advantage_weights(torch.zeros(4), inverse_temperature=3.0, largest=100.0)
+    equal = advantage_weights(torch.zeros(4), inverse_temperature=3.0, largest=100.0)
     assert equal.tolist() == [1.0] * 4
 
 
 def test_gaussian_log_likelihood_sums_dimensions_and_is_finite_at_the_bounds() -> None:
     actions, means = torch.tensor([[1.0, -1.0]]), torch.tensor([[0.0, -1.0]])
-    found = losses.gaussian_log_likelihood(actions, means, torch.tensor([0.0, math.log(0.5)]))
+    found = gaussian_log_likelihood(actions, means, torch.tensor([0.0, math.log(0.5)]))
     # -(1/2) - log(2 pi)/2, and log 2 - log(2 pi)/2
     assert found.item() == pytest.approx(-0.5 + math.log(2.0) - math.log(2 * math.pi))
     expected = torch.distributions.Normal(means, torch.tensor([1.0, 0.5])).log_prob(actions).sum()
@@ -98,7 +97,7 @@ def test_gaussian_log_likelihood_sums_dimensions_and_is_finite_at_the_bounds() -
 def test_likelihood_loss_is_the_weighted_mean_and_weights_get_no_gradient() -> None:
     weights = torch.tensor([2.0, 0.0], requires_grad=True)
     likelihoods = torch.tensor([-1.0, -9.0], requires_grad=True)
-    loss = losses.likelihood_loss(likelihoods, weights)
+    loss = likelihood_loss(likelihoods, weights)
     assert loss.item() == 1.0  # -(2 * -1 + 0) / 2
     loss.backward()  # type: ignore[no-untyped-call]
     assert weights.grad is None
@@ -107,15 +106,15 @@ def test_likelihood_loss_is_the_weighted_mean_and_weights_get_no_gradient() -> N
 
 DIFFERENTIABLE: dict[str, tuple[Any, tuple[Tensor, ...]]] = {
     "expectile": (
-        lambda v: losses.expectile_loss(v, random(5, seed=3).detach(), expectile=0.7),
+        lambda v: expectile_loss(v, random(5, seed=3).detach(), expectile=0.7),
         (random(5),),
     ),
     "gaussian": (
-        lambda m, s: losses.gaussian_log_likelihood(random(3, 2, seed=3).detach(), m, s),
+        lambda m, s: gaussian_log_likelihood(random(3, 2, seed=3).detach(), m, s),
         (random(3, 2), random(2, seed=1)),
     ),
     "likelihood": (
-        lambda p: losses.likelihood_loss(p, random(4, seed=1).detach().exp()),
+        lambda p: likelihood_loss(p, random(4, seed=1).detach().exp()),
         (random(4),),
     ),
 }
@@ -129,9 +128,9 @@ def test_gradients_are_right(name: str) -> None:
 
 def test_no_gradient_reaches_targets_or_advantages() -> None:
     targets, advantages = random(4), random(4, seed=1)
-    losses.expectile_loss(random(4, seed=2), targets, expectile=0.7).backward()  # type: ignore[no-untyped-call]
+    expectile_loss(random(4, seed=2), targets, expectile=0.7).backward()  # type: ignore[no-untyped-call]
     assert targets.grad is None
-    assert not losses.advantage_weights(advantages, inverse_temperature=1.0, largest=9.0).requires_grad
+    assert not advantage_weights(advantages, inverse_temperature=1.0, largest=9.0).requires_grad
 
 
 def test_the_likelihood_policy_starts_at_a_standard_deviation_of_one_and_stays_within_bounds() -> None:

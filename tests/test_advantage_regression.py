@@ -9,15 +9,15 @@ import torch
 from torch import Tensor
 from torch.func import functional_call, grad, vmap
 
-from tcmrl_algo.losses.advantage_regression import (
+from tcmrl_algo.algorithms.core.problem import pad_trajectories
+from tcmrl_algo.algorithms.macaw import (
     advantage_weights,
     bootstrapped_return,
     gaussian_log_likelihood,
     return_regression,
     weighted_likelihood,
 )
-from tcmrl_algo.methods.padding import pad_trajectories
-from tcmrl_algo.networks.weight_linear import WeightLinear, WeightPerceptron, apply_layer
+from tcmrl_algo.algorithms.macaw_networks import WeightLinear, WeightPerceptron, apply_layer
 from tests.made_up import problem, trajectory
 
 MASK = torch.tensor([[True, True, True], [True, True, False]])

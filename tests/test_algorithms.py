@@ -13,11 +13,10 @@ from tcmrl_cli.train import tcmrl
 from torch import Tensor
 
 from tcmrl_algo import open_run
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner
-from tcmrl_algo.methods.base import METHODS, Algorithm, Method
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.stages import StagePlan
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm, ContextLearner
+from tcmrl_algo.algorithms.core.method import METHODS, Algorithm, Method
+from tcmrl_algo.algorithms.core.problem import Problem, StagePlan
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_algo.training.config import stage_plan
 from tcmrl_data import Batch, Controller, Steps, Trajectory, Transition, UniformController
 from tests.commands import in_process

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from tcmrl_algo import resolve
-from tcmrl_algo.methods.stages import Stage, StagePlan
-from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.algorithms.core.problem import Stage, StagePlan
+from tcmrl_algo.algorithms.core.settings import RunSettings
 from tcmrl_algo.training.batches import JoinedBatches, StagedBatches, open_batches, split_request
 from tcmrl_algo.training.config import stage_plan
 from tcmrl_data import (

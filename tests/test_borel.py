@@ -11,14 +11,18 @@ import torch
 from torch import Tensor
 
 from tcmrl_algo import create_algorithm, open_run, resolve_for, train_run
-from tcmrl_algo.algorithms.borel.belief import StepValues
-from tcmrl_algo.algorithms.borel.borel import Borel, BorelLearner, joined_episodes
-from tcmrl_algo.algorithms.borel.config import BorelConfig
-from tcmrl_algo.context_methods.learner import ContextAlgorithm
-from tcmrl_algo.losses.beliefs import belief_divergence, belief_reconstruction
-from tcmrl_algo.methods.padding import pad_trajectories
-from tcmrl_algo.methods.stages import StagePlan
-from tcmrl_algo.networks.recurrent import recurrent
+from tcmrl_algo.algorithms.borel import (
+    Borel,
+    BorelConfig,
+    BorelLearner,
+    StepValues,
+    belief_divergence,
+    belief_reconstruction,
+    joined_episodes,
+    recurrent,
+)
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm
+from tcmrl_algo.algorithms.core.problem import StagePlan, pad_trajectories
 from tcmrl_data import (
     Batch,
     Dataset,

@@ -7,19 +7,14 @@ import numpy as np
 import pytest
 import torch
 
-from tcmrl_algo.actor_critic.actor_critic import ActorCritic
-from tcmrl_algo.algorithms import focal, no_context, tcmrl
-from tcmrl_algo.context_methods.attention import attention_of
-from tcmrl_algo.context_methods.learner import (
-    ContextAlgorithm,
-    ContextLearner,
-    ContextLosses,
-)
-from tcmrl_algo.losses import context as losses
-from tcmrl_algo.methods.base import MethodConfig
-from tcmrl_algo.methods.padding import pad_trajectories
-from tcmrl_algo.networks.momentum import follow, momentum_copy
-from tcmrl_algo.networks.optimizer import Adam, ParameterGroup
+from tcmrl_algo.algorithms import controls, focal, tcmrl
+from tcmrl_algo.algorithms.core.actor_critic.base import ActorCritic
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm, ContextLearner, ContextLosses, attention_of
+from tcmrl_algo.algorithms.core.losses import distance_metric_loss
+from tcmrl_algo.algorithms.core.method import MethodConfig
+from tcmrl_algo.algorithms.core.networks import follow, momentum_copy
+from tcmrl_algo.algorithms.core.optimizer import Adam, ParameterGroup
+from tcmrl_algo.algorithms.core.problem import pad_trajectories
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Transitions, UniformController
 from tests.made_up import TASKS, batch, problem, settings, trajectory, with_steps
 
@@ -58,7 +53,7 @@ def test_packed_trajectories_carry_what_lies_between_a_step_and_their_end() -> N
 
 
 def test_no_context_needs_no_trajectories() -> None:
-    request = no_context.NoContext().batch_request(settings(), MethodConfig())
+    request = controls.NoContext().batch_request(settings(), MethodConfig())
     assert request == BatchRequest(TASKS, {"policy": Transitions(5)})
 
 
@@ -84,7 +79,7 @@ def test_focal_pulls_the_means_of_a_tasks_trajectories_together() -> None:
             )
         ]
     )
-    torch.testing.assert_close(found.total, losses.distance_metric_loss(single, epsilon=0.1))
+    torch.testing.assert_close(found.total, distance_metric_loss(single, epsilon=0.1))
     for lane, values_of in enumerate(context):
         torch.testing.assert_close(found.context[lane], values_of[groups[0].mask[lane]].mean(dim=0))
 

@@ -7,13 +7,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from tcmrl_algo.algorithms.corro import Corro, CorroConfig, CorroLearner
-from tcmrl_algo.context_methods.attention import attention_of
-from tcmrl_algo.context_methods.learner import ContextAlgorithm
-from tcmrl_algo.losses.transition_contrast import outcome_error, relabelled_contrastive_loss
-from tcmrl_algo.methods.stages import StagePlan
-from tcmrl_algo.networks.attention import mean_representation
-from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm, attention_of
+from tcmrl_algo.algorithms.core.networks import mean_representation
+from tcmrl_algo.algorithms.core.problem import StagePlan
+from tcmrl_algo.algorithms.core.settings import RunSettings
+from tcmrl_algo.algorithms.corro import (
+    Corro,
+    CorroConfig,
+    CorroLearner,
+    outcome_error,
+    relabelled_contrastive_loss,
+)
 from tcmrl_algo.training.batches import open_batches
 from tcmrl_data import Batch, Dataset, Steps, TrainingError
 from tests.context_learners import algorithm_of, gradients, learner_of, losses_of, moved

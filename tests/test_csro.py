@@ -8,11 +8,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tcmrl_algo.algorithms.csro import ClubNetwork, CsroConfig, CsroLearner
-from tcmrl_algo.losses.context import distance_metric_loss
-from tcmrl_algo.losses.mutual_information import club_likelihood, club_penalty
-from tcmrl_algo.networks.attention import mean_representation
-from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.algorithms.core.losses import distance_metric_loss
+from tcmrl_algo.algorithms.core.networks import mean_representation
+from tcmrl_algo.algorithms.core.settings import RunSettings
+from tcmrl_algo.algorithms.csro import ClubNetwork, CsroConfig, CsroLearner, club_likelihood, club_penalty
 from tcmrl_data import UniformController
 from tests.context_learners import algorithm_of, gradients, learner_of, losses_of, moved
 from tests.made_up import TASKS, batch, trajectory, with_steps

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from tcmrl_algo import METHODS, TrainingSettings, resolve, train_run
-from tcmrl_algo.actor_critic.actor_critic import value_bounds
-from tcmrl_algo.methods.stages import Stage, StagePlan
-from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.algorithms.core.actor_critic.base import value_bounds
+from tcmrl_algo.algorithms.core.problem import Stage, StagePlan
+from tcmrl_algo.algorithms.core.settings import RunSettings
 from tcmrl_algo.training.batches import open_batches
 from tcmrl_data import (
     BatchRequest,

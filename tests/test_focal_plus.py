@@ -7,10 +7,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tcmrl_algo.algorithms.focal_plus import FocalPlusConfig, FocalPlusLearner
-from tcmrl_algo.losses.context import info_nce
-from tcmrl_algo.methods.base import METHODS
-from tcmrl_algo.networks.transformer import (
+from tcmrl_algo.algorithms.core.losses import info_nce
+from tcmrl_algo.algorithms.core.method import METHODS
+from tcmrl_algo.algorithms.focal_plus import (
+    FocalPlusConfig,
+    FocalPlusLearner,
     StepAttention,
     TransformerBlock,
     TransitionGate,

@@ -17,7 +17,7 @@ import torch
 import tcmrl_algo
 import tcmrl_data
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
-from tcmrl_algo.losses import context as losses
+from tcmrl_algo.algorithms.tcmrl import sparsity_loss
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tests.plugin_packages import install
 
@@ -236,4 +236,4 @@ def test_every_dependency_is_pinned_and_explained() -> None:
 def test_stated_shapes_are_checked_at_every_call() -> None:
     """pytest's `--jaxtyping-packages` in pyproject.toml does it; without it, shapes are comments."""
     with pytest.raises(jaxtyping.TypeCheckError, match="sparsity_loss"):
-        losses.sparsity_loss(torch.zeros(2, 3), torch.ones(3, 2, dtype=torch.bool))
+        sparsity_loss(torch.zeros(2, 3), torch.ones(3, 2, dtype=torch.bool))

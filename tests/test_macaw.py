@@ -13,14 +13,19 @@ from torch.nn import functional
 
 from tcmrl_algo import create_algorithm, open_run, resolve_for, train_run
 from tcmrl_algo.adaptation.arena import Arena
-from tcmrl_algo.algorithms.macaw.config import MacawConfig
-from tcmrl_algo.algorithms.macaw.macaw import Macaw, MacawLearner
-from tcmrl_algo.algorithms.macaw.networks import MacawNetworks
-from tcmrl_algo.algorithms.macaw.rows import LaneRows, evenly_spaced_rows, largest_return
-from tcmrl_algo.losses.advantage_regression import gaussian_log_likelihood
-from tcmrl_algo.methods.padding import pad_trajectories
-from tcmrl_algo.networks.weight_linear import WeightPerceptron
-from tcmrl_algo.settings.actor_critic import ActorCriticSettings
+from tcmrl_algo.algorithms.core.problem import pad_trajectories
+from tcmrl_algo.algorithms.core.settings import ActorCriticSettings
+from tcmrl_algo.algorithms.macaw import (
+    LaneRows,
+    Macaw,
+    MacawConfig,
+    MacawLearner,
+    MacawNetworks,
+    evenly_spaced_rows,
+    gaussian_log_likelihood,
+    largest_return,
+)
+from tcmrl_algo.algorithms.macaw_networks import WeightPerceptron
 from tcmrl_data import Batch, Dataset, UniformController
 from tests.context_learners import gradients
 from tests.made_up import ACTION_DIM, OBSERVATION_DIM, batch_for, problem, settings, trajectory
@@ -46,7 +51,7 @@ def rows_of(made: MacawLearner) -> tuple[LaneRows, LaneRows]:
 def losses(made: MacawLearner) -> tuple[Tensor, Tensor]:
     """Of the value network and of the policy."""
     inner, outer = rows_of(made)
-    return made.inner_step.outer_losses(made.inner_step.adapted(inner), outer)
+    return made.outer_losses(made.adapted(inner), outer)
 
 
 def test_each_outer_loss_trains_its_network_and_the_settings_of_its_inner_step() -> None:
@@ -137,7 +142,7 @@ def reference_task(
 
 
 def test_losses_and_meta_gradients_are_those_of_a_loop_over_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tcmrl_algo.losses.advantage_regression.SMALLEST_STD", 0.0)
+    monkeypatch.setattr("tcmrl_algo.algorithms.macaw.SMALLEST_STD", 0.0)
     config = MacawConfig.model_validate(SMALL)
     made = learner()
     made.networks.double()
@@ -166,7 +171,7 @@ def test_without_rates_the_outer_losses_are_those_of_the_start() -> None:
     expected = (made.networks.values(start, outer.states) - targets).square().mean()
     torch.testing.assert_close(found[0], expected)
     lanes = tuple(weights.expand(3, -1) for weights in start)
-    weights = made.inner_step.weights_of_rows(outer, lanes).weights
+    weights = made.weights_of_rows(outer, lanes).weights
     means = made.networks.means(made.networks.policy(), outer.states)
     likelihoods = gaussian_log_likelihood(outer.actions, means, std=0.2)
     expected = -(weights * likelihoods).mean()
@@ -215,7 +220,7 @@ def test_returns_are_in_units_of_the_largest_return() -> None:
 def test_a_lane_without_trajectories_keeps_the_start() -> None:
     made = learner()
     steps = pad_trajectories([[], [trajectory(6, 0)]], problem(), gamma=0.9)
-    adapted = made.inner_step.adapted(made.inner_rows(steps))
+    adapted = made.adapted(made.inner_rows(steps))
     for weights, start in zip(adapted.policy, made.networks.policy(), strict=True):
         torch.testing.assert_close(weights[0], start)
         assert not torch.allclose(weights[1], start)

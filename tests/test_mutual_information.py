@@ -6,12 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from tcmrl_algo.losses.mutual_information import (
-    club_likelihood,
-    club_penalty,
-    gaussian_reconstruction,
-    task_classification,
-)
+from tcmrl_algo.algorithms.csro import club_likelihood, club_penalty
+from tcmrl_algo.algorithms.unicorn import gaussian_reconstruction, task_classification
 
 MASK = torch.tensor([[True, True, True], [True, True, False]])
 

@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tcmrl_algo.context_methods.encoding import ContextEncoder
-from tcmrl_algo.networks.attention import TaskExtractor, uniform_attention
-from tcmrl_algo.networks.perceptron import (
+from tcmrl_algo.algorithms.core.actor_critic.sac import PolicyNetwork
+from tcmrl_algo.algorithms.core.context import ContextEncoder
+from tcmrl_algo.algorithms.core.networks import (
     LARGEST_INPUT,
     Perceptron,
     PerceptronEnsemble,
@@ -17,8 +17,8 @@ from tcmrl_algo.networks.perceptron import (
     call_frozen,
     set_hidden_dtype,
 )
-from tcmrl_algo.networks.policy import PolicyNetwork
-from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
+from tcmrl_algo.algorithms.tcmrl import RewardEstimator, TaskExtractor, side_by_side
+from tcmrl_algo.algorithms.tcmrl_variants import uniform_attention
 from tests.made_up import problem, steps
 
 

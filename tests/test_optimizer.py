@@ -3,8 +3,8 @@
 import pytest
 import torch
 
-from tcmrl_algo.networks.momentum import follow, momentum_copy
-from tcmrl_algo.networks.optimizer import Adam, ParameterGroup
+from tcmrl_algo.algorithms.core.networks import follow, momentum_copy
+from tcmrl_algo.algorithms.core.optimizer import Adam, ParameterGroup
 
 
 def test_the_learning_rate_falls_linearly_to_its_share() -> None:

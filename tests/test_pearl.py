@@ -7,9 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tcmrl_algo.algorithms.pearl import PearlLearner
-from tcmrl_algo.losses.gaussians import gaussian_divergence, product_of_gaussians
-from tcmrl_algo.methods.padding import pad_trajectories
+from tcmrl_algo.algorithms.core.losses import gaussian_divergence
+from tcmrl_algo.algorithms.core.problem import pad_trajectories
+from tcmrl_algo.algorithms.pearl import PearlLearner, product_of_gaussians
 from tests.context_learners import algorithm_of, gradients, learner_of, losses_of, moved
 from tests.made_up import batch, problem, trajectory
 

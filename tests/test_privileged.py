@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from tcmrl_algo.methods.privileged import TaskParameters
+from tcmrl_algo.algorithms.core.problem import TaskParameters
 from tcmrl_data import Task, TrainingError
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 from tcmrl_algo import PROTOCOLS, Capabilities
 from tcmrl_algo.adaptation.evaluate import contexts_of_others
 from tcmrl_algo.adaptation.protocols.non_prior import num_uniform_steps
-from tcmrl_algo.methods.privileged import TaskParameters
+from tcmrl_algo.algorithms.core.problem import TaskParameters
 from tcmrl_data import Controller, Dataset, TrainingError, Trajectory
 from tests.adapters import GOALS, GoalController, GoalReader, GoalSeeker, arena, oracle
 

@@ -16,11 +16,25 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tcmrl_algo.actor_critic.brac import DualCritic
-from tcmrl_algo.losses import actor_critic
-from tcmrl_algo.losses import context as losses
-from tcmrl_algo.networks.attention import Attention, TaskExtractor, mean_representation
-from tcmrl_algo.settings.brac import BracSettings
+from tcmrl_algo.algorithms.core.actor_critic.sac import (
+    DualCritic,
+    dual_divergence,
+    gradient_penalty,
+    policy_loss,
+    value_loss,
+)
+from tcmrl_algo.algorithms.core.losses import distance_metric_loss, info_nce, q_loss
+from tcmrl_algo.algorithms.core.networks import Attention, mean_representation
+from tcmrl_algo.algorithms.core.settings import BracSettings
+from tcmrl_algo.algorithms.tcmrl import (
+    TaskExtractor,
+    negative_reward_loss,
+    positive_reward_loss,
+    reverse_context,
+    sparsity_loss,
+    task_contrastive_loss,
+)
+from tcmrl_algo.algorithms.tcmrl_variants import negative_rewards, orthogonality_loss
 from tests.published_batches import BATCHES, LATENT, PublishedBatch, published_batch
 
 DISTANCE_WEIGHT = 10.0
@@ -90,8 +104,8 @@ def published_distance(batch: PublishedBatch, contexts: Tensor) -> float:
     same = int(sum((numbers[:place] == number).sum() for place, number in enumerate(numbers)))
     other = len(numbers) * (len(numbers) - 1) // 2 - same
     by_task = torch.stack([contexts[numbers == task] for task in np.unique(numbers)])
-    together = losses.distance_metric_loss(by_task, epsilon=0.1, attraction="root").item()
-    attraction = losses.distance_metric_loss(by_task, epsilon=1e30, attraction="root").item()
+    together = distance_metric_loss(by_task, epsilon=0.1, attraction="root").item()
+    attraction = distance_metric_loss(by_task, epsilon=1e30, attraction="root").item()
     repulsion = together - attraction
     assert (attraction > 1e-6) is (same > 0)
     return DISTANCE_WEIGHT * (attraction * same / (same + 1e-3) + repulsion * other / (other + 1e-3))
@@ -110,9 +124,7 @@ def test_contexts_are_those_of_the_published_attention(index: int) -> None:
     batch = published_batch(index)
     attention = attention_of(batch)
     close(attention.context.square().mean(), TCMRL["context"][index])
-    reverse = losses.reverse_context(
-        attention.representations, attention.weights, attention.mask, literal=True
-    )
+    reverse = reverse_context(attention.representations, attention.weights, attention.mask, literal=True)
     close(reverse.square().mean(), TCMRL["reverse"][index])
     close(published_distance(batch, attention.context.detach()), TCMRL["distance"][index])
 
@@ -121,7 +133,7 @@ def test_contexts_are_those_of_the_published_attention(index: int) -> None:
 def test_sparsity_is_the_published_sum_as_a_mean(index: int) -> None:
     """Of sigmoid(score), over all transitions of all tasks."""
     attention = attention_of(published_batch(index))
-    ours = losses.sparsity_loss(attention.scores, attention.mask)
+    ours = sparsity_loss(attention.scores, attention.mask)
     close(ours * attention.scores.numel(), TCMRL["sparsity"][index])
 
 
@@ -130,7 +142,7 @@ def test_orthogonality_is_a_mean_over_pairs_where_the_published_one_counts_all_e
     """Of the matrix of overlaps it zeroes all but one triangle, and then takes the mean of all entries."""
     attention = attention_of(published_batch(index))
     tasks = len(attention.weights)
-    ours = losses.orthogonality_loss(attention.weights)
+    ours = orthogonality_loss(attention.weights)
     close(ours * (tasks - 1) / (2 * tasks), TCMRL["orthogonality"][index])
 
 
@@ -148,11 +160,11 @@ def test_reward_losses_are_squares_where_the_published_ones_are_smooth(index: in
     batch, mask = published_batch(index), everywhere(published_batch(index))
     rewards = tensor(batch.rows["reward"]).view(mask.shape)
     good, bad = (tensor(values) for values in batch.predicted)
-    ours = losses.positive_reward_loss(good, rewards, mask)
+    ours = positive_reward_loss(good, rewards, mask)
     close(ours, TCMRL["estimator"][index])
     close(ours / 2 - smooth(good - rewards).mean(), TCMRL["positive"][index])
-    wrong = losses.negative_rewards(rewards, mask, kind="random", noise=tensor(batch.noise))
-    ours = losses.negative_reward_loss(bad, wrong, mask)
+    wrong = negative_rewards(rewards, mask, kind="random", noise=tensor(batch.noise))
+    ours = negative_reward_loss(bad, wrong, mask)
     close(ours / 2 - smooth(bad - wrong).mean(), TCMRL["negative"][index])
     assert bool(smooth(good - rewards).any()) is (index == 4)
 
@@ -169,16 +181,16 @@ def test_the_contrastive_loss_takes_its_softmax_over_the_other_side(index: int) 
     windows = representations.unfold(1, 4, 1).permute(1, 0, 3, 2)  # (positions, tasks, K, latent)
     means, last = windows[:, :, :-1].mean(dim=2), windows[:, :, -1]
     mask = torch.ones(last.shape[:2], dtype=torch.bool)
-    close(losses.info_nce(last @ weights, means, mask), TCMRL["contrastive"][index])
-    ours = losses.task_contrastive_loss(
+    close(info_nce(last @ weights, means, mask), TCMRL["contrastive"][index])
+    ours = task_contrastive_loss(
         representations.unsqueeze(1), everywhere(batch).unsqueeze(1), weights.T, window_length=4
     )
-    torch.testing.assert_close(ours, losses.info_nce(means @ weights.T, last, mask))
+    torch.testing.assert_close(ours, info_nce(means @ weights.T, last, mask))
     torch.testing.assert_close((last @ weights) @ means.mT, ((means @ weights.T) @ last.mT).mT)
 
 
 def divergences_of(values: dict[str, Tensor]) -> Tensor:
-    return actor_critic.dual_divergence(values["dual_behavior"], values["dual_policy"])
+    return dual_divergence(values["dual_behavior"], values["dual_policy"])
 
 
 @every
@@ -194,7 +206,7 @@ def test_the_dual_critic_is_penalised_by_its_gradient_where_the_published_one_is
 ) -> None:
     """With the critic's output between the actions in the gradient's place, the numbers agree."""
     values = rows(published_batch(index))
-    penalty = actor_critic.gradient_penalty(values["dual_between"].unsqueeze(-1))
+    penalty = gradient_penalty(values["dual_between"].unsqueeze(-1))
     close(5.0 * penalty - divergences_of(values).mean(), ACTOR_CRITIC["dual"][index])
 
 
@@ -203,7 +215,7 @@ def test_q_follows_the_published_targets(index: int) -> None:
     """Which take alpha D(s) off V(s'); our `value` mode takes it off V's target at s, which is not this."""
     batch = published_batch(index)
     values = rows(batch)
-    ours = actor_critic.q_loss(
+    ours = q_loss(
         torch.stack([values["q1"], values["q2"]]),
         REWARD_SCALE * values["reward"],
         values["terminated"],
@@ -218,10 +230,8 @@ def test_v_and_the_policy_follow_the_published_losses(index: int) -> None:
     batch = published_batch(index)
     values = rows(batch)
     acted = torch.minimum(values["acted_q1"], values["acted_q2"])
-    close(
-        actor_critic.value_loss(values["v"], acted - values["log_probability"]), ACTOR_CRITIC["value"][index]
-    )
-    policy = actor_critic.policy_loss(values["log_probability"], acted, entropy=1.0)
+    close(value_loss(values["v"], acted - values["log_probability"]), ACTOR_CRITIC["value"][index])
+    policy = policy_loss(values["log_probability"], acted, entropy=1.0)
     squares = sum(values[name].square().mean() for name in ("mean", "log_std"))
     penalty = batch.alpha * divergences_of(values).mean() + REGULARIZATION * squares
     close(policy + penalty, ACTOR_CRITIC["policy"][index])

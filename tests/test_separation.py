@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from tcmrl_algo import create_algorithm, open_run, resolve_for, train_run
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm
 from tcmrl_algo.algorithms.unicorn import UnicornLearner
-from tcmrl_algo.context_methods.learner import ContextAlgorithm
 from tcmrl_data import Dataset, Trajectory
 
 STEPS = 600

@@ -4,9 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tcmrl_algo.methods.stages import Stage, StagedOptimizer, StagePlan
-from tcmrl_algo.networks.optimizer import ParameterGroup
-from tcmrl_algo.settings.optimizer import OptimizerSettings
+from tcmrl_algo.algorithms.core.optimizer import ParameterGroup, StagedOptimizer
+from tcmrl_algo.algorithms.core.problem import Stage, StagePlan
+from tcmrl_algo.algorithms.core.settings import OptimizerSettings
 from tcmrl_data import BatchRequest, TrainingError, Transitions
 
 REQUEST = BatchRequest(2, {"rows": Transitions(1)})

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from tcmrl_algo.algorithms.task_known import FourierFeatures, KnownTask
-from tcmrl_algo.methods.base import METHODS
+from tcmrl_algo.algorithms.controls import FourierFeatures, KnownTask
+from tcmrl_algo.algorithms.core.method import METHODS
 from tcmrl_data import Batch, TrainingError
 from tests.made_up import OBSERVATION_DIM, batch_for, problem, settings, steps
 

@@ -10,11 +10,11 @@ from torch import Tensor
 import tcmrl_data
 from tcmrl_algo import resolve
 from tcmrl_algo.algorithms import tcmrl
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLosses
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm, ContextLosses
+from tcmrl_algo.algorithms.core.networks import call_frozen
+from tcmrl_algo.algorithms.tcmrl import negative_reward_loss, reverse_context, task_contrastive_loss
+from tcmrl_algo.algorithms.tcmrl_variants import negative_rewards
 from tcmrl_algo.experiment.config import load_experiment
-from tcmrl_algo.losses import context as context_losses
-from tcmrl_algo.losses.context import task_contrastive_loss
-from tcmrl_algo.networks.perceptron import call_frozen
 from tcmrl_data import Batch, Steps
 from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, with_steps
 
@@ -228,10 +228,10 @@ def test_negative_estimation_with_noise_of_mean_zero_fits_the_true_rewards() -> 
         attention = made.attention(batch()["context"])
         execution = made.encoder.read(batch()["execution"])
         noise = sign * torch.randn(execution.rewards.shape, generator=torch.Generator().manual_seed(5))
-        wrong = context_losses.negative_rewards(execution.rewards, execution.mask, kind="random", noise=noise)
-        reverse = context_losses.reverse_context(attention.representations, attention.weights, attention.mask)
+        wrong = negative_rewards(execution.rewards, execution.mask, kind="random", noise=noise)
+        reverse = reverse_context(attention.representations, attention.weights, attention.mask)
         misled = call_frozen(made.estimator, execution.state_actions.flatten(1, 2), reverse)
-        loss = context_losses.negative_reward_loss(misled.view(execution.mask.shape), wrong, execution.mask)
+        loss = negative_reward_loss(misled.view(execution.mask.shape), wrong, execution.mask)
         loss.backward()  # type: ignore[no-untyped-call]
         gradients = [value.grad for value in made.parameters() if value.grad is not None]
         return torch.cat([value.flatten() for value in gradients])

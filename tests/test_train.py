@@ -11,7 +11,7 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_algo
 from tcmrl_algo import open_run, resume_run, train_run
-from tcmrl_algo.methods.base import METHODS
+from tcmrl_algo.algorithms.core.method import METHODS
 from tcmrl_algo.training.train import TrainingProgress
 from tcmrl_data import CheckpointError, Dataset, SelectionError, TrainingError
 from tests.commands import Call, assert_refused, in_process

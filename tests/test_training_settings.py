@@ -7,13 +7,15 @@ from pydantic import BaseModel
 
 from tcmrl_algo import TrainingConfig, resolve
 from tcmrl_algo.algorithms import tcmrl as tcmrl_module
-from tcmrl_algo.settings.actor_critic import ActorCriticSettings
-from tcmrl_algo.settings.batch import BatchSettings
-from tcmrl_algo.settings.brac import BracSettings
-from tcmrl_algo.settings.iql import IqlSettings
-from tcmrl_algo.settings.optimizer import OptimizerSettings
-from tcmrl_algo.settings.run import RunSettings
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.settings import (
+    ActorCriticSettings,
+    BatchSettings,
+    BracSettings,
+    IqlSettings,
+    OptimizerSettings,
+    RunSettings,
+    TrainingSettings,
+)
 from tcmrl_data import Dataset, TcmrlError
 from tests.small_training import config_of
 

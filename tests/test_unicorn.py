@@ -7,10 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tcmrl_algo.algorithms.unicorn import UnicornLearner
-from tcmrl_algo.losses.context import distance_metric_loss
-from tcmrl_algo.networks.attention import mean_representation
-from tcmrl_algo.networks.gaussian import GaussianPerceptron
+from tcmrl_algo.algorithms.core.losses import distance_metric_loss
+from tcmrl_algo.algorithms.core.networks import mean_representation
+from tcmrl_algo.algorithms.unicorn import GaussianPerceptron, UnicornLearner
 from tcmrl_data import Batch
 from tests.context_learners import algorithm_of, gradients, learner_of, losses_of, moved
 from tests.made_up import TASKS, batch, with_steps

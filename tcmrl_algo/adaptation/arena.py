@@ -7,9 +7,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_algo.adaptation.lane_stage import LaneStage
-from tcmrl_algo.methods.base import Algorithm, Capabilities
-from tcmrl_algo.methods.privileged import TaskParameters
-from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.algorithms.core.method import Algorithm, Capabilities
+from tcmrl_algo.algorithms.core.problem import TaskParameters
+from tcmrl_algo.algorithms.core.settings import RunSettings
 from tcmrl_data import (
     Controller,
     Dataset,

@@ -13,7 +13,7 @@ from tcmrl_algo.adaptation.controls import dataset_controls
 from tcmrl_algo.adaptation.paths import FinalEpisodes, PathPlot
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS, Adaptation
 from tcmrl_algo.adaptation.results import Evaluation, Reference, TaskResult
-from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.algorithms.core.settings import RunSettings
 from tcmrl_algo.training.checkpoint import Run, open_run
 from tcmrl_algo.training.config import method_of
 from tcmrl_algo.training.metrics import log_evaluation

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_algo.methods.privileged import SMALLEST_STD, numbers
+from tcmrl_algo.algorithms.core.problem import SMALLEST_STD, numbers
 from tcmrl_data import Task
 
 FloatArray = npt.NDArray[np.floating]

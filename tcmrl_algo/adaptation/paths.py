@@ -7,7 +7,7 @@ from typing import final
 
 import numpy as np
 
-from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.algorithms.core.settings import RunSettings
 from tcmrl_data import Dataset, Environment, RenderingError, Trajectory
 
 PLOT_FORMATS = (".pdf", ".png", ".svg")

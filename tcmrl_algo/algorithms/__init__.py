@@ -1,1 +1,1 @@
-"""The installed methods, one per file: a `Method` with its settings and its learner."""
+"""The methods: one a file, TCMRL's other readings in a second one, and what methods share in `core`."""

@@ -47,18 +47,19 @@ from pydantic import Field, model_validator
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tcmrl_algo.context_methods.encoding import ContextEncoder, EncoderInputs
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.context_methods.requests import policy_transitions
-from tcmrl_algo.losses.gaussians import gaussian_divergence
-from tcmrl_algo.losses.transition_contrast import outcome_error, relabelled_contrastive_loss
-from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
-from tcmrl_algo.methods.stages import Stage
-from tcmrl_algo.networks.attention import Attention
-from tcmrl_algo.networks.perceptron import SMALLEST_SCALE, Perceptron
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.context import (
+    ContextAlgorithm,
+    ContextEncoder,
+    ContextLearner,
+    ContextLosses,
+    EncoderInputs,
+    policy_transitions,
+)
+from tcmrl_algo.algorithms.core.losses import Scalar, gaussian_divergence
+from tcmrl_algo.algorithms.core.method import SHARED_SEARCH, Algorithm, Factors, Method, MethodConfig, Search
+from tcmrl_algo.algorithms.core.networks import SMALLEST_SCALE, Attention, Perceptron
+from tcmrl_algo.algorithms.core.problem import Problem, Stage
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Windows
 
 CVAE, ENCODER, POLICY = "cvae", "encoder", "policy"
@@ -109,6 +110,46 @@ class CorroConfig(MethodConfig):
                 "than 1; the rest trains the policy"
             )
         return self
+
+
+def relabelled_contrastive_loss(
+    queries: Float[Tensor, "rows latent"],
+    keys: Float[Tensor, "rows latent"],
+    negatives: Float[Tensor, "rows negatives latent"],
+    *,
+    temperature: float,
+) -> Scalar:
+    """CORRO (Yuan and Lu, 2022): mean of -log( e(q.k) / (e(q.k) + sum_n e(q.n)) ), e(x) = exp(x / tau).
+
+    InfoNCE whose negatives belong to one query alone, where `info_nce` takes the keys of all others. Without
+    a negative the loss is 0.
+
+    Args:
+        queries: representations of transitions.
+        keys: of other transitions of the same task.
+        negatives: of the queries' states and actions with the outcomes of another task.
+        temperature: tau.
+    """
+    matching = torch.einsum("rd,rd->r", queries, keys).unsqueeze(-1)
+    others = torch.einsum("rd,rnd->rn", queries, negatives)
+    logits = torch.cat([matching, others], dim=-1) / temperature
+    return -torch.log_softmax(logits, dim=-1)[:, 0].mean()
+
+
+def outcome_error(
+    predicted: Float[Tensor, "rows outcomes"], outcomes: Float[Tensor, "rows outcomes"]
+) -> Scalar:
+    """CORRO's reconstruction: mean (r_hat - r)^2 + mean over dimensions of (s'_hat - s')^2, mean over rows.
+
+    Deviation: the published code compares raw rewards and states, so that their units decide how much either
+    counts; hand over standardised rewards and changes of state.
+
+    Args:
+        predicted: r_hat, then s'_hat, as `outcomes`.
+        outcomes: r, then s', or s' - s.
+    """
+    errors = (predicted - outcomes).square()
+    return errors[:, :1].mean() + errors[:, 1:].mean()
 
 
 @final

@@ -20,25 +20,33 @@ from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal, final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
-from tcmrl_algo.actor_critic.actor_critic import ActorCritic
-from tcmrl_algo.context_methods.encoding import ContextEncoder
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.context_methods.requests import trajectory_request
-from tcmrl_algo.losses.context import distance_metric_loss
-from tcmrl_algo.losses.mutual_information import club_likelihood, club_penalty
-from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig
-from tcmrl_algo.methods.padding import pad_trajectories
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
-from tcmrl_algo.networks.attention import mean_representation
-from tcmrl_algo.networks.optimizer import Adam
-from tcmrl_algo.networks.perceptron import Perceptron
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.actor_critic.base import ActorCritic
+from tcmrl_algo.algorithms.core.context import (
+    ContextAlgorithm,
+    ContextEncoder,
+    ContextLearner,
+    ContextLosses,
+    trajectory_request,
+)
+from tcmrl_algo.algorithms.core.losses import Scalar, distance_metric_loss, masked_mean
+from tcmrl_algo.algorithms.core.method import (
+    SHARED_SEARCH,
+    Algorithm,
+    Capabilities,
+    Factors,
+    Method,
+    MethodConfig,
+    Search,
+)
+from tcmrl_algo.algorithms.core.networks import Perceptron, mean_representation
+from tcmrl_algo.algorithms.core.optimizer import Adam
+from tcmrl_algo.algorithms.core.problem import Problem, pad_trajectories
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectory, UniformController
 
 SMALLEST_VARIANCE = 1e-4
@@ -75,6 +83,46 @@ class CsroConfig(MethodConfig):
     positives: Literal["none", "trajectories"] = "trajectories"
     variance: Literal["softplus", "literal"] = "literal"
     random_share: float = Field(default=0.5, gt=0, le=1)
+
+
+def club_likelihood(
+    representations: Float[Tensor, "tasks steps latent"],
+    mean: Float[Tensor, "tasks steps latent"],
+    variance: Float[Tensor, "tasks steps latent"],
+    mask: Bool[Tensor, "tasks steps"],
+) -> Scalar:
+    """Mean of (z - mu)^2 / (2 sigma^2) + log(sigma^2) / 2: what trains q(z | s, a) (CSRO, Gao et al., 2023).
+
+    The constant of the Gaussian is left out.
+    """
+    terms = 0.5 * ((representations - mean).square() / variance + variance.log())
+    return masked_mean(terms.mean(dim=-1), mask)
+
+
+def club_penalty(
+    representations: Float[Tensor, "tasks steps latent"],
+    mean: Float[Tensor, "tasks steps latent"],
+    variance: Float[Tensor, "tasks steps latent"],
+    mask: Bool[Tensor, "tasks steps"],
+) -> Scalar:
+    """CSRO's bound of I(z; s, a): P - N, P = -mean_t (z_t - mu_t)^2 / sigma_t^2, N = the same over all pairs.
+
+    N = -mean_ij (z_j - mu_i)^2 / sigma_i^2 over pairs of one task, i = j included. The published code expands
+    all pairs; here mean_j (z_j - mu_i)^2 = Var_j(z_j) + (mean_j z_j - mu_i)^2, with the biased variance.
+    As in that code there is no 1/2 and a mean over dimensions: the value is 2 / latent times CLUB's estimate
+    (Cheng et al., 2020).
+
+    Args:
+        representations: z_t.
+        mean, variance: of q(z | s_t, a_t); hand them over without gradient.
+        mask: real transitions.
+    """
+    real = mask.unsqueeze(-1)
+    number = real.sum(dim=1, keepdim=True).clamp(min=1)
+    center = torch.where(real, representations, 0.0).sum(dim=1, keepdim=True) / number
+    spread = torch.where(real, (representations - center).square(), 0.0).sum(dim=1, keepdim=True) / number
+    pairs = spread + (center - mean).square()
+    return masked_mean(((pairs - (representations - mean).square()) / variance).mean(dim=-1), mask)
 
 
 @final

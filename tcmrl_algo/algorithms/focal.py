@@ -7,15 +7,18 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from tcmrl_algo.context_methods.encoding import ContextEncoder
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.context_methods.requests import trajectory_request
-from tcmrl_algo.losses import context as losses
-from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
-from tcmrl_algo.networks.attention import mean_representation
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.context import (
+    ContextAlgorithm,
+    ContextEncoder,
+    ContextLearner,
+    ContextLosses,
+    trajectory_request,
+)
+from tcmrl_algo.algorithms.core.losses import distance_metric_loss
+from tcmrl_algo.algorithms.core.method import SHARED_SEARCH, Algorithm, Factors, Method, MethodConfig, Search
+from tcmrl_algo.algorithms.core.networks import mean_representation
+from tcmrl_algo.algorithms.core.problem import Problem
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps
 
 
@@ -53,7 +56,7 @@ class FocalLearner(ContextLearner):
         representations = torch.cat(self.encoder(*groups), dim=1)
         mask = torch.cat([group.mask for group in groups], dim=1)
         single = mean_representation(representations.flatten(0, 1), mask.flatten(0, 1))
-        distance = losses.distance_metric_loss(
+        distance = distance_metric_loss(
             single.unflatten(0, mask.shape[:2]),
             epsilon=self._config.epsilon,
             attraction=self._config.attraction,

@@ -21,24 +21,38 @@ from collections.abc import Sequence
 from typing import ClassVar, Literal, final
 
 import torch
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from pydantic import Field
 from torch import Tensor
 from torch.nn import functional
 
-from tcmrl_algo.actor_critic.actor_critic import ActorCritic
-from tcmrl_algo.context_methods.encoding import ContextEncoder
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.context_methods.requests import policy_transitions
-from tcmrl_algo.losses.gaussians import gaussian_divergence, product_of_gaussians
-from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.actor_critic.base import ActorCritic
+from tcmrl_algo.algorithms.core.context import (
+    ContextAlgorithm,
+    ContextEncoder,
+    ContextLearner,
+    ContextLosses,
+    policy_transitions,
+)
+from tcmrl_algo.algorithms.core.losses import gaussian_divergence
+from tcmrl_algo.algorithms.core.method import (
+    SHARED_SEARCH,
+    Algorithm,
+    Capabilities,
+    Factors,
+    Method,
+    MethodConfig,
+    Search,
+)
+from tcmrl_algo.algorithms.core.problem import Problem
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectories, Trajectory
 
 POSTERIOR_STREAM, PRIOR_STREAM = 2, 3
 """Of the draws at test, apart from those of training."""
+
+SMALLEST_VARIANCE = 1e-7
+"""Of a factor of a product, whose precision would be infinite below (published code of PEARL)."""
 
 
 class PearlConfig(MethodConfig):
@@ -57,6 +71,23 @@ class PearlConfig(MethodConfig):
     kl_weight: float = Field(default=0.1, ge=0)
     prior_std: float = Field(default=1.0, gt=0)
     test_context: Literal["sample", "mean"] = "sample"
+
+
+def product_of_gaussians(
+    means: Float[Tensor, "lanes steps latent"],
+    variances: Float[Tensor, "lanes steps latent"],
+    mask: Bool[Tensor, "lanes steps"],
+) -> tuple[Float[Tensor, "lanes latent"], Float[Tensor, "lanes latent"]]:
+    """Mean and variance of prod_t N(mu_t, sigma_t^2), up to its scale (PEARL, Rakelly et al., 2019).
+
+    sigma^2 = 1 / sum_t 1 / sigma_t^2, mu = sigma^2 sum_t mu_t / sigma_t^2. Padding has precision 0; without a
+    real step the result is the prior N(0, I), which is no factor otherwise.
+    """
+    precisions = torch.where(mask.unsqueeze(-1), 1.0 / variances.clamp(min=SMALLEST_VARIANCE), 0.0)
+    some = mask.any(dim=1, keepdim=True)
+    precision = torch.where(some, precisions.sum(dim=1), 1.0)
+    weighted = torch.where(mask.unsqueeze(-1), means * precisions, 0.0)
+    return weighted.sum(dim=1) / precision, 1.0 / precision
 
 
 @final

@@ -1,31 +1,56 @@
-"""TCMRL: a task characteristic extractor trained by reward estimation, and a task contrastive loss."""
+"""TCMRL: a task characteristic extractor trained by reward estimation, and a task contrastive loss.
 
+The paper is "Task characteristic and contrastive contexts for improving generalization in offline
+meta-reinforcement learning". Its equations stand below in its order, each with its formula, its number and
+our deviations; what several methods use stands in `core/`:
+
+    Eq. 1      c_t = e(s_t, a_t, r_t, s_{t+1})                        core/context.py, ContextEncoder
+    Eq. 2      c_mean = mean(c_1, ..., c_T)                           core/networks.py, mean_representation
+    Eq. 3-5    w = softmax_t q(c_t, c_mean), c = sum_t w_t c_t        TaskExtractor
+    Eq. 6      L_spa = ||(w_1, ..., w_T)||_1                          sparsity_loss
+    Eq. 7      L_pos = sum_t (r_hat(s'_t, a'_t, c) - r'_t)^2          positive_reward_loss
+    Eq. 8      L_neg = sum_t (r_hat(s'_t, a'_t, c_neg) - r_neg_t)^2   negative_reward_loss, reverse_context
+    Eq. 9-10   -log(exp(q_i . k_i) / sum_l exp(q_i . k_l))            core/losses.py, info_nce
+    Eq. 11-12  Eq. 10 of m_i^t W and c_l^{t+K-1}, summed over t       task_contrastive_loss
+    Eq. 17-18  L_pos and L_neg of the return of a trajectory          positive_, negative_return_loss
+
+Wherever the paper sums over time, the mean over real transitions is taken, so that loss weights mean the same
+for short and long episodes. `mask` is True on real transitions and False on padding, which never changes a
+value or a gradient. Readings that are not the default stand in `tcmrl_variants.py`.
+"""
+
+from collections.abc import Sequence
 from typing import ClassVar, Literal, final
 
 import torch
 from jaxtyping import Bool, Float
 from pydantic import BaseModel, ConfigDict, Field
 from torch import Tensor, nn
+from torch.nn import functional
 
-from tcmrl_algo.context_methods.encoding import ContextEncoder, EncoderInputs
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.context_methods.requests import policy_transitions
-from tcmrl_algo.losses import context as losses
-from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig, Metrics
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import SHARED_SEARCH, Options, Search
-from tcmrl_algo.networks.attention import Attention, TaskExtractor, uniform_attention
-from tcmrl_algo.networks.perceptron import call_frozen
-from tcmrl_algo.networks.reward_estimator import RewardEstimator, side_by_side
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms import tcmrl_variants as variants
+from tcmrl_algo.algorithms.core.context import (
+    ContextAlgorithm,
+    ContextEncoder,
+    ContextLearner,
+    ContextLosses,
+    EncoderInputs,
+    policy_transitions,
+)
+from tcmrl_algo.algorithms.core.losses import Scalar, distance_metric_loss, info_nce, masked_mean
+from tcmrl_algo.algorithms.core.method import (
+    SHARED_SEARCH,
+    Algorithm,
+    Method,
+    MethodConfig,
+    Metrics,
+    Options,
+    Search,
+)
+from tcmrl_algo.algorithms.core.networks import Attention, Perceptron, call_frozen, mean_representation
+from tcmrl_algo.algorithms.core.problem import Problem
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Windows
-
-SPARSITY = {
-    "sigmoid": losses.sparsity_loss,
-    "centered": losses.centered_sparsity_loss,
-    "entropy": losses.entropy_sparsity_loss,
-}
-"""Readings of Eq. 6 that are functions of the scores."""
 
 TRIED_WEIGHTS = Options((0.0, 0.01, 0.1, 1.0))
 """Of loss terms, beside a weight of 1 for `positive`."""
@@ -80,9 +105,9 @@ class TcmrlConfig(MethodConfig):
             bias satisfies it (ours); `entropy` is that of the weights (ours); `literal` is the printed form,
             constant and without gradient. `weights.sparsity = 0` leaves it out.
         reverse_scale: `mean` divides c_neg by T - 1 (ours), which brings it close to the mean context;
-            `sum` leaves it as printed (see `losses.context.reverse_context`).
+            `sum` leaves it as printed (see `reverse_context`).
         negative_reward: how targets of L_neg are made wrong (paper, G.3: `random`). On average, `random`
-            targets are the true rewards (see `losses.context.negative_reward_loss`).
+            targets are the true rewards (see `negative_reward_loss`).
         negative_noise: standard deviation of `random`, in standard deviations of the reward
             (published code: 0.5, of the raw reward).
         negative_bias: mean of that noise, likewise (paper and published code: 0). Any other makes `random`
@@ -102,12 +127,198 @@ class TcmrlConfig(MethodConfig):
     estimator_training: Literal["always", "positive"] = "always"
     sparsity: Literal["sigmoid", "centered", "entropy", "literal"] = "sigmoid"
     reverse_scale: Literal["mean", "sum"] = "mean"
-    negative_reward: losses.NegativeKind = "random"
+    negative_reward: variants.NegativeKind = "random"
     negative_noise: float = Field(default=0.5, ge=0)
     negative_bias: float = 0.0
     temperature: float = Field(default=1.0, gt=0)
     distance_examples: int = Field(default=1, ge=1)
     weights: Weights = Weights()
+
+
+@final
+class TaskExtractor(nn.Module):
+    """The task characteristic extractor, Eq. 2-5: scores transitions against their mean and aggregates them.
+
+    Args:
+        latent: size of a representation.
+        hidden: widths of q's sigmoid layers (paper, F.2: 256); empty makes q linear, as in the code.
+        generator: draws the start.
+    """
+
+    def __init__(self, latent: int, *, hidden: Sequence[int], generator: torch.Generator) -> None:
+        super().__init__()
+        self.perceptron = Perceptron((2 * latent, *hidden, 1), generator=generator, activation=torch.sigmoid_)
+
+    def forward(
+        self, representations: Float[Tensor, "lanes steps latent"], mask: Bool[Tensor, "lanes steps"]
+    ) -> Attention:
+        """Attention over each lane's real transitions, of which there must be at least one.
+
+        c_mean = mean(c_1, ..., c_T); score_t = q(c_t, c_mean); w = softmax(score); c = sum_t w_t c_t.
+        """
+        mean = mean_representation(representations, mask).unsqueeze(1)
+        inputs = torch.cat([representations, mean.expand_as(representations)], dim=-1)
+        scores = self.perceptron(inputs).squeeze(-1)
+        weights = torch.softmax(torch.where(mask, scores, -torch.inf), dim=-1)
+        context = torch.einsum("lt,ltd->ld", weights, torch.where(mask.unsqueeze(-1), representations, 0.0))
+        return Attention(representations, scores, weights, context, mask)
+
+
+def sparsity_loss(scores: Float[Tensor, "lanes steps"], mask: Bool[Tensor, "lanes steps"]) -> Scalar:
+    """Our reading of Eq. 6: mean over transitions of sigmoid(score).
+
+    Deviation: the printed form is constant (see `literal_sparsity_loss`). Scores before the softmax are
+    free to fall for all but the telling transitions. They may also fall for all transitions together, which
+    lowers this loss and changes no weight; other readings in `tcmrl_variants.py` rule that out.
+    """
+    return masked_mean(torch.sigmoid(scores), mask)
+
+
+@final
+class RewardEstimator(nn.Module):
+    """r_hat(s, a, c), the reward of a transition, or r_hat(s_1, a_1, ..., c), the return of a trajectory.
+
+    Args:
+        inputs: width of what is estimated on: a transition's state and action (Eq. 7 and 8), or those of a
+            whole trajectory `side_by_side` (Eq. 17 and 18).
+        latent: size of the context.
+        hidden: widths of the layers.
+        generator: draws the start.
+    """
+
+    def __init__(
+        self, inputs: int, *, latent: int, hidden: Sequence[int], generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.perceptron = Perceptron((inputs + latent, *hidden, 1), generator=generator)
+
+    def forward(
+        self, inputs: Float[Tensor, "tasks rows inputs"], context: Float[Tensor, "tasks latent"]
+    ) -> Float[Tensor, "tasks rows"]:
+        """One estimate per row, under its task's context."""
+        spread = context.unsqueeze(1).expand(-1, inputs.shape[1], -1)
+        values: Tensor = self.perceptron(torch.cat([inputs, spread], dim=-1))
+        return values.squeeze(-1)
+
+
+def side_by_side(
+    steps: Float[Tensor, "tasks trajectories steps inputs"],
+    mask: Bool[Tensor, "tasks trajectories steps"],
+    *,
+    horizon: int,
+) -> Float[Tensor, "tasks trajectories all_inputs"]:
+    """The steps of a trajectory as one vector; steps that an episode does not have are zeros."""
+    real = torch.where(mask.unsqueeze(-1), steps, 0.0)
+    return functional.pad(real, (0, 0, 0, horizon - steps.shape[2])).flatten(2)
+
+
+def positive_reward_loss(
+    predicted: Float[Tensor, "*lanes steps"],
+    rewards: Float[Tensor, "*lanes steps"],
+    mask: Bool[Tensor, "*lanes steps"],
+) -> Scalar:
+    """Eq. 7: L_pos = sum_t (r_hat(s'_t, a'_t, c) - r'_t)^2, as a mean over real steps."""
+    return masked_mean((predicted - rewards) ** 2, mask)
+
+
+def reverse_context(
+    representations: Float[Tensor, "lanes steps latent"],
+    weights: Float[Tensor, "lanes steps"],
+    mask: Bool[Tensor, "lanes steps"],
+    *,
+    literal: bool = False,
+) -> Float[Tensor, "lanes latent"]:
+    """The context of what attention neglects: c_neg = sum_t (1 - w_t) c_t / (T - 1) (text above Eq. 8).
+
+    With the mean representation c_mean (Eq. 2) and the context c = sum_t w_t c_t (Eq. 5),
+    c_neg = (T c_mean - c) / (T - 1) = c_mean + (c_mean - c) / (T - 1): nearly the mean context for all but
+    the shortest lanes, whatever the attention is. Undivided, it points the same way and is T - 1 times
+    as long, which is outside of what the reward estimator sees of contexts in L_pos.
+
+    Args:
+        representations: c_t.
+        weights: attention weights w_t, which sum to 1 over each lane's real steps.
+        mask: real steps; T is their number, lane by lane.
+        literal: leave the sum undivided, as printed. Its weights sum to T - 1, so its scale grows with T.
+    """
+    reverse = torch.where(mask, 1.0 - weights, 0.0)
+    if not literal:
+        reverse = reverse / (mask.sum(dim=-1, keepdim=True) - 1).clamp(min=1)
+    return torch.einsum("lt,ltd->ld", reverse, representations)
+
+
+def negative_reward_loss(
+    predicted: Float[Tensor, "*lanes steps"],
+    negative: Float[Tensor, "*lanes steps"],
+    mask: Bool[Tensor, "*lanes steps"],
+) -> Scalar:
+    """Eq. 8: L_neg = sum_t (r_hat(s'_t, a'_t, c_neg) - r_neg_t)^2, as a mean over real steps.
+
+    `predicted` must come from an estimator whose parameters are held fixed: the paper keeps L_neg from
+    training it (`call_frozen` does that).
+
+    With r_neg = r' + e and noise e of mean zero and variance v that is independent of r_hat,
+    E (r_hat - r' - e)^2 = (r_hat - r')^2 + v: the expected loss is that of the true reward plus a constant,
+    and so the expected gradient trains c_neg, too, to predict the true reward. The noise adds variance alone.
+    With noise of mean b the expected gradient is that of fitting r' + b.
+    """
+    return masked_mean((predicted - negative) ** 2, mask)
+
+
+def task_contrastive_loss(
+    representations: Float[Tensor, "tasks trajectories steps latent"],
+    mask: Bool[Tensor, "tasks trajectories steps"],
+    similarity: Float[Tensor, "latent latent"],
+    *,
+    window_length: int,
+    temperature: float = 1.0,
+) -> Scalar:
+    """Eq. 11-12: L_TCL = -1/(T-K+1) 1/B sum_t sum_i log softmax_l(m_i^t W c_l^{t+K-1})[i].
+
+    m^t is the mean of the K - 1 representations before the window's last one. Deviations: the printed
+    log(a / sum a) is undefined for negative a, so Eq. 10's exponentials stand in; and a query keeps its own
+    m_i in the denominator, as in Eq. 10, where Eq. 11 prints m_l. Of tasks that end early, position t knows
+    only those with a whole window there.
+
+    Args:
+        representations: c_t of the n-th trajectory of every task; windows at equal (n, t) are compared.
+        mask: real steps, padding at the end.
+        similarity: W.
+        window_length: K > 1. Trajectories shorter than K have no window.
+        temperature: divides the logits (not in the paper's Eq. 11; 1 there).
+    """
+    if representations.shape[2] < window_length:
+        return (representations * 0.0).sum() + (similarity * 0.0).sum()
+    last = window_length - 1
+    flat = representations[:, :, :-1].flatten(0, 1).transpose(1, 2)  # every step but the last begins a prior
+    priors = functional.avg_pool1d(flat, last, stride=1).transpose(1, 2)
+    return info_nce(
+        (priors @ similarity).unflatten(0, representations.shape[:2]).permute(1, 2, 0, 3),
+        representations[:, :, last:].permute(1, 2, 0, 3),
+        mask[:, :, last:].permute(1, 2, 0),  # padding is at the end: the last step being real suffices
+        temperature=temperature,
+    )
+
+
+def positive_return_loss(
+    predicted: Float[Tensor, "*lanes"],
+    rewards: Float[Tensor, "*lanes steps"],
+    mask: Bool[Tensor, "*lanes steps"],
+) -> Scalar:
+    """Eq. 17 (sparse rewards): L_pos = (r_hat(s'_1, a'_1, ..., s'_T, a'_T, c) - sum_t r'_t)^2, lane mean."""
+    return ((predicted - torch.where(mask, rewards, 0.0).sum(dim=-1)) ** 2).mean()
+
+
+def negative_return_loss(
+    predicted: Float[Tensor, "*lanes"],
+    negative: Float[Tensor, "*lanes steps"],
+    mask: Bool[Tensor, "*lanes steps"],
+) -> Scalar:
+    """Eq. 18 (sparse rewards): L_neg = (r_hat(..., c_neg) - sum_t r_neg_t)^2, lane mean.
+
+    As for Eq. 8, the estimator behind `predicted` must be held fixed.
+    """
+    return ((predicted - torch.where(mask, negative, 0.0).sum(dim=-1)) ** 2).mean()
 
 
 @final
@@ -160,10 +371,18 @@ class TcmrlLearner(ContextLearner):
         terms |= self._attention_losses(attention)
         if weights.contrastive:
             last = representations[-1] if windows is not context else representations[0]
-            terms["contrastive"] = self._contrastive_loss(last, windows.mask)
+            terms["contrastive"] = task_contrastive_loss(
+                last,
+                windows.mask,
+                self.similarity,
+                window_length=self._window_length,
+                temperature=self.config.temperature,
+            )
         if weights.distance:
             mask = torch.cat([context.mask, examples.mask], dim=1)
-            terms["distance"] = self._distance_loss(torch.cat(representations[:2], dim=1), mask)
+            single = torch.cat(representations[:2], dim=1).flatten(0, 1)  # one context per trajectory
+            contexts = self._attend(single, mask.flatten(0, 1)).context
+            terms["distance"] = distance_metric_loss(contexts.unflatten(0, mask.shape[:2]))
         total = attention.context.new_zeros(())
         for name, term in terms.items():
             total = total + getattr(weights, name, ESTIMATOR_WEIGHT) * term
@@ -177,7 +396,7 @@ class TcmrlLearner(ContextLearner):
     ) -> Attention:
         """Eq. 2-5, one softmax over all transitions of a lane, or their mean."""
         if self.config.extractor == "mean":
-            return uniform_attention(representations, mask)
+            return variants.uniform_attention(representations, mask)
         result: Attention = self.extractor(representations, mask)
         return result
 
@@ -199,7 +418,7 @@ class TcmrlLearner(ContextLearner):
             inputs = execution.state_actions.flatten(1, 2)
         terms: Metrics = {}
         has_negative = weights.negative > 0 and config.extractor == "attention"
-        positive = losses.positive_return_loss if whole else losses.positive_reward_loss
+        positive = positive_return_loss if whole else positive_reward_loss
         if weights.positive:
             predicted = self.estimator(inputs, attention.context)
             terms["positive"] = positive(predicted.view(shape), rewards, mask)
@@ -210,45 +429,30 @@ class TcmrlLearner(ContextLearner):
             unit = self._horizon if whole else 1
             draws = torch.randn(rewards.shape, generator=generator).to(rewards.device)
             noise = config.negative_noise / unit * draws + config.negative_bias / unit
-            wrong = losses.negative_rewards(rewards, mask, kind=config.negative_reward, noise=noise)
-            reverse = losses.reverse_context(
+            wrong = variants.negative_rewards(rewards, mask, kind=config.negative_reward, noise=noise)
+            reverse = reverse_context(
                 attention.representations,
                 attention.weights,
                 attention.mask,
                 literal=config.reverse_scale == "sum",
             )
             misled = call_frozen(self.estimator, inputs, reverse)
-            negative = losses.negative_return_loss if whole else losses.negative_reward_loss
+            negative = negative_return_loss if whole else negative_reward_loss
             terms["negative"] = negative(misled.view(shape), wrong, mask)
         return terms
 
     def _attention_losses(self, attention: Attention) -> Metrics:
         """Eq. 6, and the published code's orthogonality."""
-        weights, terms = self.config.weights, {}
-        if self.config.extractor == "mean":
+        config, terms = self.config, {}
+        if config.extractor == "mean":
             return {}
-        if weights.sparsity:
-            if self.config.sparsity == "literal":
-                terms["sparsity"] = losses.literal_sparsity_loss(attention.weights, attention.mask)
-            else:
-                terms["sparsity"] = SPARSITY[self.config.sparsity](attention.scores, attention.mask)
-        if weights.orthogonality:
-            terms["orthogonality"] = losses.orthogonality_loss(attention.weights)
+        if config.weights.sparsity:
+            reading = sparsity_loss if config.sparsity == "sigmoid" else variants.SPARSITY[config.sparsity]
+            read = attention.weights if config.sparsity == "literal" else attention.scores
+            terms["sparsity"] = reading(read, attention.mask)
+        if config.weights.orthogonality:
+            terms["orthogonality"] = variants.orthogonality_loss(attention.weights)
         return terms
-
-    def _contrastive_loss(self, representations: Tensor, mask: Tensor) -> Tensor:
-        return losses.task_contrastive_loss(
-            representations,
-            mask,
-            self.similarity,
-            window_length=self._window_length,
-            temperature=self.config.temperature,
-        )
-
-    def _distance_loss(self, representations: Tensor, mask: Tensor) -> Tensor:
-        """FOCAL's loss over the contexts of single trajectories."""
-        contexts = self._attend(representations.flatten(0, 1), mask.flatten(0, 1)).context
-        return losses.distance_metric_loss(contexts.unflatten(0, mask.shape[:2]))
 
 
 @final

@@ -18,29 +18,44 @@ code adds noise at test too; here contexts are means over that noise, so that ad
 """
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar, Literal, final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int64
 from pydantic import Field
 from torch import Tensor, nn
+from torch.nn import functional
 
-from tcmrl_algo.context_methods.encoding import ContextEncoder, EncoderInputs
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.context_methods.requests import trajectory_request
-from tcmrl_algo.losses.context import distance_metric_loss
-from tcmrl_algo.losses.mutual_information import gaussian_reconstruction, task_classification
-from tcmrl_algo.methods.base import Algorithm, Capabilities, Method, MethodConfig, Metrics
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.methods.search import SHARED_SEARCH, Factors, Search
-from tcmrl_algo.networks.attention import mean_representation
-from tcmrl_algo.networks.gaussian import GaussianPerceptron
-from tcmrl_algo.networks.perceptron import Perceptron
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.context import (
+    ContextAlgorithm,
+    ContextEncoder,
+    ContextLearner,
+    ContextLosses,
+    EncoderInputs,
+    trajectory_request,
+)
+from tcmrl_algo.algorithms.core.losses import Scalar, distance_metric_loss, masked_mean
+from tcmrl_algo.algorithms.core.method import (
+    SHARED_SEARCH,
+    Algorithm,
+    Capabilities,
+    Factors,
+    Method,
+    MethodConfig,
+    Metrics,
+    Search,
+)
+from tcmrl_algo.algorithms.core.networks import Perceptron, held_between, mean_representation
+from tcmrl_algo.algorithms.core.problem import Problem
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps
 
 NOISE_LEVELS = 16
 """At how many equally likely values of the noise representations are averaged at test."""
+
+LOG_VARIANCE_START = (-10.0, 0.5)
+"""Bounds of the log variance before training (Chua et al., 2018, in the implementation of mbrl-lib)."""
 
 
 class UnicornConfig(MethodConfig):
@@ -71,6 +86,58 @@ class UnicornConfig(MethodConfig):
     bound_weight: float = Field(default=0.01, ge=0)
     reconstruction: Literal["context", "execution"] = "context"
     classifier_hidden: tuple[int, ...] = (64, 64)
+
+
+def gaussian_reconstruction(
+    mean: Float[Tensor, "*rows outputs"],
+    log_variance: Float[Tensor, "*rows outputs"],
+    targets: Float[Tensor, "*rows outputs"],
+    mask: Bool[Tensor, "*rows"],
+) -> Scalar:
+    """Mean of (x - mu)^2 exp(-log sigma^2) + log sigma^2: twice a Gaussian's -log p(x), without the constant.
+
+    UNICORN's L_recon (Li et al., 2024), whose negative bounds I(z; s', r | s, a) from below up to a constant.
+    """
+    terms = (targets - mean).square() * (-log_variance).exp() + log_variance
+    return masked_mean(terms.mean(dim=-1), mask)
+
+
+def task_classification(logits: Float[Tensor, "tasks classes"], positions: Int64[Tensor, " tasks"]) -> Scalar:
+    """Cross-entropy of the training task, -mean log p(task | z): UNICORN-SUP (Li et al., 2024).
+
+    Args:
+        logits: of every training task, for every context.
+        positions: dense index of the task that a context comes from.
+    """
+    return functional.cross_entropy(logits, positions)
+
+
+@final
+class GaussianPerceptron(nn.Module):
+    """Mean and log variance, the latter held between learnt bounds by softplus from either side.
+
+    Args:
+        sizes: width of input, hidden layers and output.
+        generator: draws the start.
+    """
+
+    def __init__(self, sizes: Sequence[int], *, generator: torch.Generator) -> None:
+        super().__init__()
+        *first, outputs = sizes
+        self.perceptron = Perceptron((*first, 2 * outputs), generator=generator)
+        low, high = LOG_VARIANCE_START
+        self.lowest = nn.Parameter(torch.full((outputs,), low))
+        self.highest = nn.Parameter(torch.full((outputs,), high))
+
+    def forward(
+        self, inputs: Float[Tensor, "*rows inputs"]
+    ) -> tuple[Float[Tensor, "*rows outputs"], Float[Tensor, "*rows outputs"]]:
+        mean, free = self.perceptron(inputs).chunk(2, dim=-1)
+        return mean, held_between(free, self.lowest, self.highest)
+
+    def width(self) -> Float[Tensor, ""]:
+        """The sum over outputs of the distance between the bounds; a loss that keeps them close."""
+        return (self.highest - self.lowest).sum()
 
 
 @final

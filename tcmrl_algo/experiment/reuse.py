@@ -4,11 +4,11 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from tcmrl_algo.algorithms.core.settings import EVALUATION_KEYS, LOGGING_KEYS
 from tcmrl_algo.experiment.config import experiment_of, run_id
 from tcmrl_algo.experiment.job import Curve, Job, SharedTraining
 from tcmrl_algo.experiment.planning import completed
 from tcmrl_algo.experiment.results import RunResult, read_results
-from tcmrl_algo.settings.run import EVALUATION_KEYS, LOGGING_KEYS
 from tcmrl_algo.training.checkpoint import open_run, write_run
 from tcmrl_data.foundation.records import write_record
 

@@ -9,8 +9,7 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_algo.context_methods.attention import attention_of
-from tcmrl_algo.context_methods.learner import ContextAlgorithm
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm, attention_of
 from tcmrl_algo.experiment.results import ContextMeasures
 from tcmrl_algo.reporting.sources import FinishedRun
 from tcmrl_algo.training.checkpoint import open_run

@@ -5,8 +5,8 @@ What a short search found for them may be luck, and then decides more than the m
 
 from typing import Any
 
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_algo.experiment.results import RunResult
-from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_data.foundation.canonical import differences
 
 UNCOMPARED = frozenset({"run.algorithm", "run.threads"})

@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from tcmrl_algo.algorithms.core.settings import LOGGING_KEYS, TrainingSettings
 from tcmrl_algo.experiment.compact import compact
 from tcmrl_algo.experiment.flat import Row, merged, read_table, write_table
 from tcmrl_algo.experiment.results import ContextMeasures, RunResult, success_rate
 from tcmrl_algo.reporting.measuring import Measured
 from tcmrl_algo.reporting.returns import DatasetReturns
-from tcmrl_algo.settings.run import LOGGING_KEYS
-from tcmrl_algo.settings.training import TrainingSettings
 from tcmrl_algo.training.config import stage_plan
 from tcmrl_algo.tuning.record import read_tuning
 from tcmrl_algo.tuning.table import TrialRow, trial_rows

@@ -9,8 +9,8 @@ from typing import Protocol, final, runtime_checkable
 
 import torch
 
-from tcmrl_algo.methods.stages import StagePlan
-from tcmrl_algo.settings.run import RunSettings
+from tcmrl_algo.algorithms.core.problem import StagePlan
+from tcmrl_algo.algorithms.core.settings import RunSettings
 from tcmrl_data import (
     Batch,
     BatchRequest,

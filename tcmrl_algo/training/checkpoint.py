@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from safetensors import SafetensorError
 from torch import Tensor
 
-from tcmrl_algo.methods.problem import MomentsRecord
+from tcmrl_algo.algorithms.core.problem import MomentsRecord
 from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_data import CheckpointError, Dataset, open_dataset
 from tcmrl_data.foundation.canonical import sha256

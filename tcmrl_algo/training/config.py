@@ -5,10 +5,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from tcmrl_algo.methods.base import METHODS, Method
-from tcmrl_algo.methods.stages import StagePlan
-from tcmrl_algo.settings.run import PROTOCOL_GROUP
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.method import METHODS, Method
+from tcmrl_algo.algorithms.core.problem import StagePlan
+from tcmrl_algo.algorithms.core.settings import PROTOCOL_GROUP, TrainingSettings
 from tcmrl_data import Dataset, Profile, TrainingError, apply_overrides, load_recipe
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
 from tcmrl_data.foundation.plugins import check_declared

@@ -11,9 +11,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from tcmrl_algo.methods.base import Algorithm
-from tcmrl_algo.methods.privileged import TaskParameters
-from tcmrl_algo.methods.problem import MomentsRecord, problem_of
+from tcmrl_algo.algorithms.core.method import Algorithm
+from tcmrl_algo.algorithms.core.problem import MomentsRecord, TaskParameters, problem_of
 from tcmrl_algo.training.batches import StagedBatches, open_batches
 from tcmrl_algo.training.checkpoint import Run, RunRecord, open_run, tensors_digest, write_run
 from tcmrl_algo.training.config import TrainingConfig, method_of, stage_plan

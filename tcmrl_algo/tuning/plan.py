@@ -5,11 +5,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import final
 
+from tcmrl_algo.algorithms.core.method import METHODS, SettingValue
+from tcmrl_algo.algorithms.core.settings import PROTOCOL_GROUP
 from tcmrl_algo.experiment.config import override_texts
 from tcmrl_algo.experiment.planning import training_tables
-from tcmrl_algo.methods.base import METHODS
-from tcmrl_algo.methods.search import SettingValue
-from tcmrl_algo.settings.run import PROTOCOL_GROUP
 from tcmrl_algo.training.config import TrainingConfig, resolve_for
 from tcmrl_algo.training.train import PACKAGES
 from tcmrl_algo.tuning.holding_out import checked_tasks, held_out_tasks

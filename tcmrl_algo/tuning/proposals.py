@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from tcmrl_algo.methods.search import SettingValue
+from tcmrl_algo.algorithms.core.method import SettingValue
 from tcmrl_algo.tuning.record import Trial
 from tcmrl_algo.tuning.space import Dimension, Space
 from tcmrl_data import NO_TASK, Purpose, keyed_seed

@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
+from tcmrl_algo.algorithms.core.method import SettingValue
 from tcmrl_algo.experiment.config import override_texts
-from tcmrl_algo.methods.search import SettingValue
 from tcmrl_algo.tuning.space import Dimension
 from tcmrl_data import Profile
 from tcmrl_data.foundation.records import read_record

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict
 
-from tcmrl_algo.methods.search import Factors, Search, SettingValue
+from tcmrl_algo.algorithms.core.method import Factors, Search, SettingValue
 from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_data import TrainingError
 

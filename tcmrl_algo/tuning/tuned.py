@@ -3,9 +3,9 @@
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from tcmrl_algo.algorithms.core.method import METHODS
 from tcmrl_algo.experiment.config import Experiment
 from tcmrl_algo.experiment.results import Tuned
-from tcmrl_algo.methods.base import METHODS
 from tcmrl_algo.tuning.space import searched
 from tcmrl_algo.tuning.table import TrialRow, best_settings, read_trials
 from tcmrl_data import TrainingError

@@ -12,18 +12,17 @@ from tcmrl_algo import (
     Method,
     MethodConfig,
     Metrics,
-    NetworkAlgorithm,
     Problem,
     TrainingSettings,
     pad_trajectories,
 )
-from tcmrl_algo.networks.perceptron import linear
+from tcmrl_algo.algorithms.core.networks import linear
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectories, Trajectory, Transition
 
 BELIEF = 4
 
 
-class BeliefLearner(NetworkAlgorithm):
+class BeliefLearner(Algorithm):
     """A recurrent belief trained by copying the actions of trajectories."""
 
     def __init__(self, problem: Problem, settings: TrainingSettings) -> None:

@@ -11,12 +11,11 @@ from tcmrl_algo import (
     Method,
     MethodConfig,
     Metrics,
-    NetworkAlgorithm,
     Problem,
     TrainingSettings,
     pad_trajectories,
 )
-from tcmrl_algo.networks.perceptron import linear
+from tcmrl_algo.algorithms.core.networks import linear
 from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectory, Transitions
 
 
@@ -32,7 +31,7 @@ class GradientConfig(MethodConfig):
     gamma: float = 0.9
 
 
-class GradientLearner(NetworkAlgorithm):
+class GradientLearner(Algorithm):
     """MAML over return-weighted regression."""
 
     def __init__(self, problem: Problem, settings: TrainingSettings, config: GradientConfig) -> None:

@@ -12,15 +12,14 @@ from tcmrl_algo import (
     Method,
     MethodConfig,
     Metrics,
-    NetworkAlgorithm,
     Problem,
     TrainingSettings,
 )
-from tcmrl_algo.networks.perceptron import linear
+from tcmrl_algo.algorithms.core.networks import linear
 from tcmrl_data import Batch, BatchRequest, Controller, Trajectory, Transitions
 
 
-class InformedLearner(NetworkAlgorithm):
+class InformedLearner(Algorithm):
     """A linear policy of the state and the task's parameters."""
 
     def __init__(self, problem: Problem, settings: TrainingSettings) -> None:

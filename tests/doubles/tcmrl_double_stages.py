@@ -17,7 +17,7 @@ from tcmrl_algo import (
     TrainingSettings,
     policy_transitions,
 )
-from tcmrl_algo.networks.perceptron import linear
+from tcmrl_algo.algorithms.core.networks import linear
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Transitions
 
 

@@ -12,14 +12,17 @@ from jaxtyping import Float
 from pydantic import Field
 from torch import Tensor
 
-from tcmrl_algo.context_methods.encoding import ContextEncoder
-from tcmrl_algo.context_methods.learner import ContextAlgorithm, ContextLearner, ContextLosses
-from tcmrl_algo.context_methods.requests import policy_transitions
-from tcmrl_algo.methods.base import Algorithm, Method, MethodConfig
-from tcmrl_algo.methods.problem import Problem
-from tcmrl_algo.networks.attention import mean_representation
-from tcmrl_algo.networks.perceptron import Perceptron
-from tcmrl_algo.settings.training import TrainingSettings
+from tcmrl_algo.algorithms.core.context import (
+    ContextAlgorithm,
+    ContextEncoder,
+    ContextLearner,
+    ContextLosses,
+    policy_transitions,
+)
+from tcmrl_algo.algorithms.core.method import Algorithm, Method, MethodConfig
+from tcmrl_algo.algorithms.core.networks import Perceptron, mean_representation
+from tcmrl_algo.algorithms.core.problem import Problem
+from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories
 
 

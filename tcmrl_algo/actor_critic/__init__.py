@@ -1,1 +1,0 @@
-"""The offline actor-critic that context-based methods share."""

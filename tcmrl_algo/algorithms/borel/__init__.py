@@ -1,1 +1,0 @@
-"""BOReL: a policy that acts by its belief of the task."""

@@ -1,0 +1,1 @@
+"""The offline actor-critics under every method that adapts through a context."""

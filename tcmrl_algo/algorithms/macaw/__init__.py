@@ -1,1 +1,0 @@
-"""MACAW: adaptation by one gradient step, meta-learned through it."""

@@ -1,1 +1,0 @@
-"""Equations as pure functions, which import torch only."""

@@ -1,1 +1,0 @@
-"""Networks and their optimiser, which import torch only."""

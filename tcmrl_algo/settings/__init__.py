@@ -1,1 +1,0 @@
-"""Tables of a run's settings: validated values alone."""
