@@ -16,7 +16,6 @@ from tcmrl_algo.algorithms.core.actor_critic.sac import (
 )
 from tcmrl_algo.algorithms.core.losses import distance_metric_loss, info_nce, masked_mean, q_loss
 from tcmrl_algo.algorithms.tcmrl import (
-    NegativeKind,
     negative_return_loss,
     negative_reward_loss,
     positive_return_loss,
@@ -26,6 +25,7 @@ from tcmrl_algo.algorithms.tcmrl import (
     task_contrastive_loss,
 )
 from tcmrl_algo.algorithms.tcmrl_variants import (
+    NegativeKind,
     centered_sparsity_loss,
     entropy_sparsity_loss,
     literal_sparsity_loss,
