@@ -145,7 +145,7 @@ LIKELIHOOD_LOG_STD = (-5.0, 2.0)
 """Bounds of the log standard deviation of `LikelihoodPolicy` (published code of IQL)."""
 
 
-def held_between(free: Tensor, low: float, high: float) -> Tensor:
+def held_between(free: Tensor, low: float | Tensor, high: float | Tensor) -> Tensor:
     """Values in [low, high] by softplus from either side: the identity between, never without a gradient."""
     below = high - functional.softplus(high - free)
     return low + functional.softplus(below - low)
