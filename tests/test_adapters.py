@@ -26,7 +26,7 @@ from tcmrl_data import (
     keyed_seed,
     open_sampler,
 )
-from tcmrl_data.foundation.errors import MissingPackageError, SelectionError, StoreError
+from tcmrl_data.foundation.errors import MissingPackageError, SelectionError
 from tcmrl_data.interchange.sb3 import to_sb3_buffer
 from tcmrl_data.interchange.tensordict import to_tensordict, view_steps
 from tcmrl_data.interchange.torch_dataset import TrajectoryDataset
@@ -215,18 +215,6 @@ def test_minari_opens_iterates_and_samples_what_was_exported(
         assert len(opened.sample_episodes(5)) == 5
         steps = [entry["snapshot_step"] for entry in opened.storage.get_episode_metadata(range(12))]
         assert steps == [100] * 6 + [150] * 6
-
-
-def test_minari_refuses_an_episode_without_steps(
-    tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("minari")
-    none = np.zeros(0, dtype=bool)
-    empty = Trajectory(np.zeros((1, 2)), np.zeros((0, 2)), np.zeros(0), none, none)
-    monkeypatch.setattr(Dataset, "trajectories", lambda self, *key: [empty])
-    with pytest.raises(StoreError, match=r"0000150.zip: episode 0 has no steps.*hdf5"):
-        export_dataset(tiny, "minari", tmp_path / "out", snapshots="last")
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_minari_knows_the_scores_and_makes_the_task_again(

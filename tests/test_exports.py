@@ -16,7 +16,6 @@ from tcmrl_data import FORMATS, Dataset, Trajectory, export_dataset, import_data
 from tcmrl_data.foundation.disk import lock_file
 from tcmrl_data.foundation.errors import LockedError, SelectionError, StoreError, TaskError
 from tcmrl_data.interchange.exporting import LOCK, staging_folder
-from tcmrl_data.interchange.hdf5 import EPISODE_ARRAYS
 from tests.conftest import TASKS
 from tests.test_adapters import terminated_early
 from tests.test_interchange import assert_equal
@@ -376,7 +375,6 @@ def test_a_table_of_another_program_is_read(codec: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(first.observations, [[0, 0], [1, 1], [2, 2], [3, 3]])
     assert (first.terminated[-1], second.truncated[-1]) == (True, True)
     assert list(first.extras) == ["effort"]
-    assert EPISODE_ARRAYS[0] == "observations"
 
 
 def table() -> dict[str, Any]:

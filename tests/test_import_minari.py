@@ -1,4 +1,4 @@
-"""Minari datasets: those that were exported here, and those that Minari's own collector wrote."""
+"""Minari datasets that Minari's own collector wrote; `test_exports.py` has those that were exported here."""
 
 import warnings
 from pathlib import Path
@@ -7,21 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tcmrl_data import Dataset, export_dataset, import_dataset, open_dataset, verify_dataset
+from tcmrl_data import import_dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.minari import dataset_id
-from tests.conftest import TASKS
-from tests.test_interchange import assert_equal
 
 minari = pytest.importorskip("minari")
 LENGTHS = (4, 3)
-
-
-@pytest.fixture(scope="module")
-def exported(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
-    out = tmp_path_factory.mktemp("exports") / "minari"
-    export_dataset(tiny, "minari", out)
-    return [out / dataset_id(tiny, task) for task in TASKS]
 
 
 def collected(folder: Path, monkeypatch: pytest.MonkeyPatch, *, nested: bool = False) -> Path:
@@ -58,17 +48,6 @@ def collected(folder: Path, monkeypatch: pytest.MonkeyPatch, *, nested: bool = F
     return folder / "made" / "here-v0"
 
 
-def test_what_was_exported_comes_back(tiny: Dataset, exported: list[Path], tmp_path: Path) -> None:
-    import_dataset("minari", exported, tmp_path / "data")
-    found = open_dataset(tmp_path / "data")
-    assert list(found.parts) == list(tiny.parts)
-    assert [task.parameters for task in found.tasks] == [task.parameters for task in tiny.tasks]
-    for key in tiny.parts:
-        for left, right in zip(found.trajectories(*key), tiny.trajectories(*key), strict=True):
-            assert_equal(left, right)
-    assert verify_dataset(found.folder, level="deep").findings == ()
-
-
 def test_a_dataset_of_minari_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = collected(tmp_path / "minari", monkeypatch)
     import_dataset("minari", [path], tmp_path / "data", task=3)
@@ -80,8 +59,16 @@ def test_a_dataset_of_minari_itself(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     assert {name: list(values) for name, values in second.extras.items()} == {"success": [False, True, True]}
     assert found.part(3, 0).statistics.success_rate == 1.0
     assert verify_dataset(found.folder, level="deep").findings == ()
-    import_dataset("minari", [path], tmp_path / "a", options={"observation_keys": "a"})
+    monkeypatch.chdir(path)
+    (tmp_path / "linked").symlink_to(path)
+    import_dataset("minari", [Path("../here-v0")], tmp_path / "a", options={"observation_keys": "a"})
     assert open_dataset(tmp_path / "a").environment.observation_dim == 1
+    (path / "data").rename(tmp_path / "blobs")
+    (path / "data").mkdir()
+    for file in (tmp_path / "blobs").iterdir():
+        (path / "data" / file.name).symlink_to(file)
+    linked = import_dataset("minari", [tmp_path / "linked"], tmp_path / "links", task=3)
+    assert linked.episodes == 2
 
 
 def test_what_is_no_flat_minari_dataset_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -127,13 +127,6 @@ def test_hdf5_says_where_it_comes_from(tiny: Dataset, exported: Path) -> None:
         assert attributes["snapshots"].tolist() == [0, 100, 150]
 
 
-def test_hdf5_takes_a_selection_of_snapshots(tiny: Dataset, tmp_path: Path) -> None:
-    export_dataset(tiny, "hdf5", tmp_path / "last", snapshots="last")
-    back = read_hdf5(tmp_path / "last" / "task_00000.hdf5")
-    for left, right in zip(tiny.trajectories(0, 150), back, strict=True):
-        assert_equal(left, right)
-
-
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.lists(trajectories(), min_size=1, max_size=4))
 def test_hdf5_round_trip_of_any_episodes(

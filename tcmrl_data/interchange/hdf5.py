@@ -146,11 +146,15 @@ def read_hdf5(path: str | Path) -> list[Trajectory]:
                 raise StoreError(
                     f"{path}: format_version {version} is not {FORMAT_VERSION}, which this version reads"
                 )
-            groups = (group for _, group in sorted(file["episodes"].items()))
-            arrays = [{name: np.asarray(values[()]) for name, values in group.items()} for group in groups]
+            return [_stored_episode(group) for _, group in sorted(file["episodes"].items())]
     except OSError as error:
         raise StoreError(f"{path} does not open as HDF5 ({error}); export the dataset again") from None
-    return [Trajectory(*(found.pop(name) for name in EPISODE_ARRAYS), found) for found in arrays]
+
+
+def _stored_episode(group: h5py.Group) -> Trajectory:
+    arrays = {name: np.asarray(values[()]) for name, values in group.items()}
+    observations, actions, rewards, terminated, truncated = (arrays.pop(name) for name in EPISODE_ARRAYS)
+    return Trajectory(observations, actions, rewards, terminated, truncated, arrays)
 
 
 class Hdf5Options(ObservationOptions):
