@@ -21,6 +21,7 @@ from torch import Tensor, nn
 from torch.utils.flop_counter import FlopCounterMode
 
 from tcmrl_algo import ContextAlgorithm
+from tcmrl_algo.algorithms.core import optimizer
 from tcmrl_algo.algorithms.core.method import METHODS
 from tcmrl_algo.algorithms.core.problem import Problem, StagePlan
 from tcmrl_algo.algorithms.core.settings import TrainingSettings
@@ -222,7 +223,7 @@ def components(sizes: Sizes, *, algorithm: str, precision: str, repeats: int) ->
     watch.watch(made.learner, "losses", "context losses forward")
     watch.watch(made.actor_critic, "losses", "actor-critic forward")
     watch.watch(Tensor, "backward", "backward")
-    watch.watch(made._adam._adam, "step", "optimizer")
+    watch.watch(optimizer, "_descend", "optimizer")
     watch.watch(made.actor_critic, "after_step", "target network")
     watch.watch(made, "update", "rest")
     for step in range(2, 2 + repeats):

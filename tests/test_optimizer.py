@@ -10,11 +10,30 @@ from tcmrl_algo.algorithms.core.optimizer import Adam, ParameterGroup
 def test_the_learning_rate_falls_linearly_to_its_share() -> None:
     layer = torch.nn.Linear(1, 1)
     adam = Adam(layer.named_parameters(), learning_rate=1.0, final_share=0.2, decay_steps=10)
-    rates = []
-    for done in (0, 5, 10, 30):
-        adam.step(layer.weight.sum(), steps_done=done)
-        rates.append(adam._adam.param_groups[0]["lr"])
+    rates = [rate for done in (0, 5, 10, 30) for rate in adam.rates(done)]
     assert rates == pytest.approx([1.0, 0.6, 0.2, 0.2])
+
+
+def test_steps_are_those_of_torchs_adam_to_the_bit_also_where_a_gradient_is_missing() -> None:
+    own, other = torch.nn.Linear(3, 2), torch.nn.Linear(3, 2)
+    other.load_state_dict(own.state_dict())
+    adam, reference = (
+        Adam(own.named_parameters(), learning_rate=0.1),
+        torch.optim.Adam(other.parameters(), lr=0.1, fused=True),
+    )
+    inputs = torch.linspace(-1.0, 1.0, 12).view(4, 3)
+    for step in range(6):
+        losses = [
+            (layer.weight.sum() ** 2 if step == 2 else layer(inputs).square().sum()) for layer in (own, other)
+        ]
+        adam.step(losses[0])
+        reference.zero_grad()
+        losses[1].backward()
+        reference.step()
+        for name, value in other.named_parameters():
+            assert torch.equal(own.get_parameter(name), value)
+            for moment in ("step", "exp_avg", "exp_avg_sq"):
+                assert torch.equal(adam.tensors()[f"{name}/{moment}"], reference.state[value][moment])
 
 
 def test_gradients_are_bounded_where_asked() -> None:

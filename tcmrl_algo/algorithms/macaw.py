@@ -53,7 +53,7 @@ from torch.func import grad, vmap
 from torch.nn import functional
 
 from tcmrl_algo.algorithms.core.context import policy_transitions
-from tcmrl_algo.algorithms.core.losses import Scalar, masked_mean
+from tcmrl_algo.algorithms.core.losses import Scalar
 from tcmrl_algo.algorithms.core.method import (
     Algorithm,
     Capabilities,
@@ -117,7 +117,7 @@ def return_regression(
     values: Float[Tensor, "*rows"], targets: Float[Tensor, "*rows"], mask: Bool[Tensor, "*rows"]
 ) -> Scalar:
     """Mean of (V(s) - G)^2 (MACAW, Mitchell et al., 2021)."""
-    return masked_mean((values - targets).square(), mask)
+    return _mean((values - targets).square(), mask)
 
 
 def bootstrapped_return(
@@ -165,7 +165,12 @@ def weighted_likelihood(
     log_likelihoods: Float[Tensor, "*rows"], weights: Float[Tensor, "*rows"], mask: Bool[Tensor, "*rows"]
 ) -> Scalar:
     """Mean of -w log pi(a | s) (advantage-weighted regression, Peng et al., 2019)."""
-    return masked_mean(-weights * log_likelihoods, mask)
+    return _mean(-weights * log_likelihoods, mask)
+
+
+def _mean(values: Tensor, mask: Tensor) -> Scalar:
+    """As `masked_mean`, within `vmap` too, where no mask can be asked whether all of it is True."""
+    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
 
 
 @final

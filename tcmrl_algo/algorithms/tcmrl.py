@@ -37,7 +37,7 @@ from tcmrl_algo.algorithms.core.context import (
     EncoderInputs,
     policy_transitions,
 )
-from tcmrl_algo.algorithms.core.losses import Scalar, distance_metric_loss, info_nce, masked_mean
+from tcmrl_algo.algorithms.core.losses import Scalar, distance_metric_loss, info_nce, masked_mean, where_real
 from tcmrl_algo.algorithms.core.method import (
     SHARED_SEARCH,
     Algorithm,
@@ -159,8 +159,8 @@ class TaskExtractor(nn.Module):
         mean = mean_representation(representations, mask).unsqueeze(1)
         inputs = torch.cat([representations, mean.expand_as(representations)], dim=-1)
         scores = self.perceptron(inputs).squeeze(-1)
-        weights = torch.softmax(torch.where(mask, scores, -torch.inf), dim=-1)
-        context = torch.einsum("lt,ltd->ld", weights, torch.where(mask.unsqueeze(-1), representations, 0.0))
+        weights = torch.softmax(where_real(mask, scores, -torch.inf), dim=-1)
+        context = torch.einsum("lt,ltd->ld", weights, where_real(mask.unsqueeze(-1), representations, 0.0))
         return Attention(representations, scores, weights, context, mask)
 
 
@@ -208,7 +208,7 @@ def side_by_side(
     horizon: int,
 ) -> Float[Tensor, "tasks trajectories all_inputs"]:
     """The steps of a trajectory as one vector; steps that an episode does not have are zeros."""
-    real = torch.where(mask.unsqueeze(-1), steps, 0.0)
+    real = where_real(mask.unsqueeze(-1), steps, 0.0)
     return functional.pad(real, (0, 0, 0, horizon - steps.shape[2])).flatten(2)
 
 
@@ -241,7 +241,7 @@ def reverse_context(
         mask: real steps; T is their number, lane by lane.
         literal: leave the sum undivided, as printed. Its weights sum to T - 1, so its scale grows with T.
     """
-    reverse = torch.where(mask, 1.0 - weights, 0.0)
+    reverse = where_real(mask, 1.0 - weights, 0.0)
     if not literal:
         reverse = reverse / (mask.sum(dim=-1, keepdim=True) - 1).clamp(min=1)
     return torch.einsum("lt,ltd->ld", reverse, representations)
@@ -306,7 +306,7 @@ def positive_return_loss(
     mask: Bool[Tensor, "*lanes steps"],
 ) -> Scalar:
     """Eq. 17 (sparse rewards): L_pos = (r_hat(s'_1, a'_1, ..., s'_T, a'_T, c) - sum_t r'_t)^2, lane mean."""
-    return ((predicted - torch.where(mask, rewards, 0.0).sum(dim=-1)) ** 2).mean()
+    return ((predicted - where_real(mask, rewards, 0.0).sum(dim=-1)) ** 2).mean()
 
 
 def negative_return_loss(
@@ -318,7 +318,7 @@ def negative_return_loss(
 
     As for Eq. 8, the estimator behind `predicted` must be held fixed.
     """
-    return ((predicted - torch.where(mask, negative, 0.0).sum(dim=-1)) ** 2).mean()
+    return ((predicted - where_real(mask, negative, 0.0).sum(dim=-1)) ** 2).mean()
 
 
 @final

@@ -3,6 +3,7 @@
 `mask` is True on real entries and False on padding; padding never changes a value or a gradient.
 """
 
+import functools
 import math
 from typing import Literal
 
@@ -13,9 +14,20 @@ from torch import Tensor
 Scalar = Float[Tensor, ""]
 
 
+def where_real(mask: Bool[Tensor, "*rows"], values: Tensor, padding: float) -> Tensor:
+    """The values where the mask is True, and `padding` elsewhere; the values as they are without padding.
+
+    Most batches hold none, and a mask in vain takes as long as an equation. A GPU is not asked: it would have
+    to be waited for.
+    """
+    if mask.device.type == "cpu" and bool(mask.all()):
+        return values
+    return torch.where(mask, values, padding)
+
+
 def masked_mean(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"]) -> Scalar:
     """Mean of the values where the mask is True; 0 where it is nowhere True."""
-    return torch.where(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
+    return where_real(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
 
 
 def info_nce(
@@ -39,10 +51,10 @@ def info_nce(
     # contiguous, mask included: otherwise products fall back to one small product per position
     queries, keys, mask = queries.contiguous(), keys.contiguous(), mask.contiguous()
     logits = queries @ keys.mT / temperature
-    logits = torch.where(mask.unsqueeze(-2), logits, -torch.inf)
+    logits = where_real(mask.unsqueeze(-2), logits, -torch.inf)
     present = mask & (mask.sum(dim=-1, keepdim=True) > 1)  # a lone task has nothing to be told apart from
-    logits = torch.where(present.unsqueeze(-1), logits, 0.0)  # keeps rows without any key free of NaN
-    matching = torch.diagonal(torch.log_softmax(logits, dim=-1), dim1=-2, dim2=-1)
+    logits = where_real(present.unsqueeze(-1), logits, 0.0)  # keeps rows without any key free of NaN
+    matching = torch.diagonal(torch.log_softmax(logits, dim=-1), dim1=-2, dim2=-1).contiguous()
     return -masked_mean(matching, present)
 
 
@@ -65,11 +77,20 @@ def distance_metric_loss(
     """
     flat = contexts.flatten(0, 1)
     squares = (flat.unsqueeze(0) - flat.unsqueeze(1)).square().mean(dim=-1)
-    tasks = torch.arange(len(contexts), device=flat.device).repeat_interleave(contexts.shape[1])
-    same = tasks.unsqueeze(0) == tasks.unsqueeze(1)
-    pairs = ~torch.eye(len(tasks), dtype=torch.bool, device=flat.device)
     distances = squares if attraction == "square" else (squares + 1e-3).sqrt()
-    return masked_mean(distances, same & pairs) + masked_mean(1.0 / (squares + epsilon), ~same)
+    same, others, num_same, num_others = _pairs(*contexts.shape[:2], flat.device)
+    attracted = torch.where(same, distances, 0.0).sum() / num_same
+    return attracted + torch.where(others, 1.0 / (squares + epsilon), 0.0).sum() / num_others
+
+
+@functools.lru_cache(maxsize=64)
+def _pairs(tasks: int, examples: int, device: torch.device) -> tuple[Tensor, Tensor, int, int]:
+    """Which two different examples are of one task, which are of two, and how many either; at least 1."""
+    task = torch.arange(tasks, device=device).repeat_interleave(examples)
+    same = task.unsqueeze(0) == task.unsqueeze(1)
+    others = ~same
+    same = same & ~torch.eye(len(task), dtype=torch.bool, device=device)
+    return same, others, max(int(same.sum()), 1), max(int(others.sum()), 1)
 
 
 def gaussian_divergence(

@@ -7,6 +7,7 @@ import copy
 import itertools
 import math
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from typing import TypeVar, final
 
@@ -14,6 +15,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor, nn
 from torch.nn import functional
+
+from tcmrl_algo.algorithms.core.losses import where_real
 
 Activation = Callable[[Tensor], Tensor]
 
@@ -35,8 +38,14 @@ def linear(inputs: int, outputs: int, generator: torch.Generator) -> nn.Linear:
 
 def call_frozen(module: nn.Module, *inputs: Tensor) -> Tensor:
     """The module's output with its parameters held fixed: gradients reach the inputs alone."""
-    parameters = {name: parameter.detach() for name, parameter in module.named_parameters()}
-    result: Tensor = torch.func.functional_call(module, parameters, inputs)
+    trained = [parameter for parameter in module.parameters() if parameter.requires_grad]
+    for parameter in trained:
+        parameter.requires_grad_(False)
+    try:
+        result: Tensor = module(*inputs)
+    finally:
+        for parameter in trained:
+            parameter.requires_grad_(True)
     return result
 
 
@@ -68,11 +77,12 @@ class Perceptron(nn.Module):
 
     def forward(self, inputs: Float[Tensor, "*rows inputs"]) -> Float[Tensor, "*rows outputs"]:
         rows = inputs.reshape(-1, inputs.shape[-1])  # an activation in place on a view would copy gradients
+        *hidden, last = self.layers
         reduced = self.hidden_dtype is not torch.float32
-        with torch.autocast(rows.device.type, self.hidden_dtype, enabled=reduced):
-            for layer in self.layers[:-1]:
+        with torch.autocast(rows.device.type, self.hidden_dtype) if reduced else nullcontext():
+            for layer in hidden:
                 rows = self._activation(layer(rows))
-        outputs: Tensor = self.layers[-1](rows.to(inputs.dtype))
+        outputs: Tensor = last(rows.to(inputs.dtype))
         return outputs.view(*inputs.shape[:-1], outputs.shape[-1])
 
 
@@ -183,7 +193,7 @@ def mean_representation(
 ) -> Float[Tensor, "lanes latent"]:
     """Eq. 2: c_mean = mean(c_1, ..., c_T) over each lane's real steps; FOCAL's context."""
     real = mask.unsqueeze(-1)
-    return torch.where(real, representations, 0.0).sum(dim=1) / real.sum(dim=1)
+    return where_real(real, representations, 0.0).sum(dim=1) / real.sum(dim=1)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Adam with a linear decay, whose whole state is named tensors, and one Adam for every stage of training."""
 
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import final
 
 import torch
@@ -9,8 +9,6 @@ from torch import Tensor, nn
 
 from tcmrl_algo.algorithms.core.problem import StagePlan
 from tcmrl_algo.algorithms.core.settings import OptimizerSettings
-
-MOMENTS = ("step", "exp_avg", "exp_avg_sq")
 
 
 @dataclass(frozen=True)
@@ -24,6 +22,16 @@ class ParameterGroup:
 
     learning_rate: float
     gradient_norm: float | None = None
+
+
+@dataclass
+class _Memory:
+    """What Adam remembers of a parameter: its steps, and the averages of its gradient and of the square."""
+
+    parameter: nn.Parameter
+    steps: int = 0
+    average: Tensor = field(default_factory=lambda: torch.empty(0))
+    square: Tensor = field(default_factory=lambda: torch.empty(0))
 
 
 @final
@@ -53,49 +61,89 @@ class Adam:
         gradient_norm: float | None = None,
         groups: Mapping[str, ParameterGroup] | None = None,
     ) -> None:
-        self._parameters = {name: value for name, value in parameters if value.requires_grad}
+        self._memories = {name: _Memory(value) for name, value in parameters if value.requires_grad}
+        if not self._memories:
+            raise ValueError("there is no parameter to train")
         self._final_share, self._decay_steps = final_share, decay_steps
         settings = {"": ParameterGroup(learning_rate, gradient_norm), **(groups or {})}
-        members: dict[str, list[nn.Parameter]] = {prefix: [] for prefix in settings}
-        for name, parameter in self._parameters.items():
-            members[max((prefix for prefix in settings if is_below(name, prefix)), key=len)].append(parameter)
+        members: dict[str, list[str]] = {prefix: [] for prefix in settings}
+        for name in self._memories:
+            members[max((prefix for prefix in settings if is_below(name, prefix)), key=len)].append(name)
         for prefix, group in members.items():
             if prefix and not group:
                 raise ValueError(f"no parameter to train is named {prefix!r} or lies below it")
-        self._groups = [(settings[prefix], group) for prefix, group in members.items() if group]
-        self._adam = torch.optim.Adam(
-            [{"params": group, "lr": own.learning_rate} for own, group in self._groups], fused=True
-        )
+        self._groups = [
+            (settings[prefix], [self._memories[name] for name in group])
+            for prefix, group in members.items()
+            if group
+        ]
+
+    def rates(self, steps_done: int) -> list[float]:
+        """The learning rate of every group after so many steps."""
+        progress = min(steps_done / self._decay_steps, 1.0)
+        share = 1.0 - (1.0 - self._final_share) * progress
+        return [own.learning_rate * share for own, _ in self._groups]
 
     def step(self, loss: Tensor, *, steps_done: int = 0) -> None:
         """One descent step of `loss`; the learning rates are a function of `steps_done` alone."""
-        progress = min(steps_done / self._decay_steps, 1.0)
-        share = 1.0 - (1.0 - self._final_share) * progress
-        for values, (own, _) in zip(self._adam.param_groups, self._groups, strict=True):
-            values["lr"] = own.learning_rate * share
-        self._adam.zero_grad(set_to_none=True)
+        for memory in self._memories.values():
+            memory.parameter.grad = None
         loss.backward()
-        for own, group in self._groups:
+        for (own, group), rate in zip(self._groups, self.rates(steps_done), strict=True):
             if own.gradient_norm is not None:
-                nn.utils.clip_grad_norm_(group, own.gradient_norm)
-        self._adam.step()
+                nn.utils.clip_grad_norm_([memory.parameter for memory in group], own.gradient_norm)
+            _descend([memory for memory in group if memory.parameter.grad is not None], rate)
 
     def tensors(self) -> dict[str, Tensor]:
         """Moments and step counts by parameter name; empty before the first step."""
-        return {
-            f"{name}/{moment}": self._adam.state[parameter][moment]
-            for name, parameter in self._parameters.items()
-            for moment in MOMENTS
-            if parameter in self._adam.state
-        }
+        found = {}
+        for name, memory in self._memories.items():
+            if memory.steps:
+                found[f"{name}/step"] = torch.tensor(float(memory.steps))
+                found[f"{name}/exp_avg"], found[f"{name}/exp_avg_sq"] = memory.average, memory.square
+        return found
 
     def load_tensors(self, tensors: Mapping[str, Tensor]) -> None:
         """Takes over what `tensors` returned."""
-        for name, parameter in self._parameters.items():
+        for name, memory in self._memories.items():
             if f"{name}/step" in tensors:
-                self._adam.state[parameter] = {
-                    moment: tensors[f"{name}/{moment}"].to(parameter.device, copy=True) for moment in MOMENTS
-                }
+                memory.steps = int(tensors[f"{name}/step"])
+                memory.average, memory.square = (
+                    tensors[f"{name}/{moment}"].to(memory.parameter.device, copy=True)
+                    for moment in ("exp_avg", "exp_avg_sq")
+                )
+
+
+@torch.no_grad()
+def _descend(memories: Sequence[_Memory], rate: float) -> None:
+    """One step along the gradients, to the bit that of `torch.optim.Adam(fused=True)`.
+
+    That class counts the steps of every parameter in a tensor of its own and reads its options anew in every
+    step, which takes longer than the step itself where networks are small.
+    """
+    if not memories:
+        return
+    for memory in memories:
+        if not memory.steps:
+            memory.average, memory.square = (torch.zeros_like(memory.parameter) for _ in range(2))
+        memory.steps += 1
+    device = memories[0].parameter.device
+    counts = {steps: torch.tensor(float(steps), device=device) for steps in {one.steps for one in memories}}
+    torch._fused_adam_(
+        [memory.parameter for memory in memories],
+        [memory.parameter.grad for memory in memories],
+        [memory.average for memory in memories],
+        [memory.square for memory in memories],
+        [],
+        [counts[memory.steps] for memory in memories],
+        lr=rate,
+        beta1=0.9,
+        beta2=0.999,
+        weight_decay=0.0,
+        eps=1e-8,
+        amsgrad=False,
+        maximize=False,
+    )
 
 
 def is_below(name: str, prefix: str) -> bool:
@@ -128,7 +176,7 @@ class StagedOptimizer:
         parts: Mapping[str, Collection[str]] | None = None,
         groups: Mapping[str, ParameterGroup] | None = None,
     ) -> None:
-        self._stages = stages
+        self._stages, self._begun = stages, ""
         self._parameters = {name: value for name, value in module.named_parameters() if value.requires_grad}
         self._trained = {stage.name: self._below((parts or {}).get(stage.name, ("",))) for stage in stages}
         self.adams = {
@@ -145,9 +193,11 @@ class StagedOptimizer:
 
     def begin(self, step: int) -> None:
         """Freezes what the step's stage does not train; call it before the step's losses are computed."""
-        trained = self._trained[self._stages.at(step).stage]
-        for name, parameter in self._parameters.items():
-            parameter.requires_grad_(name in trained)
+        stage = self._stages.at(step).stage
+        if stage != self._begun:
+            for name, parameter in self._parameters.items():
+                parameter.requires_grad_(name in self._trained[stage])
+            self._begun = stage
 
     def step(self, loss: Tensor, step: int) -> None:
         """One descent step of `loss` by the Adam of the stage in which `step` lies."""

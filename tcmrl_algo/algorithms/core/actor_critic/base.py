@@ -115,8 +115,9 @@ class ActorCritic(nn.Module, abc.ABC):
             critic_gradient: leaves the context in `critic_inputs` attached, so that Q's loss trains it, or
                 that of a policy without critic; nothing else does.
         """
-        following = context if next_context is None else next_context
-        contexts = [_by_row(value, steps) for value in (context, following)]
+        contexts = [_by_row(context, steps)] * 2
+        if next_context is not None:
+            contexts[1] = _by_row(next_context, steps)
         states = torch.stack([steps.observations, steps.next_observations]).flatten(1, -2)
         detached = torch.stack([value.detach() for value in contexts])
         inputs = torch.cat([self.scaling(states), detached], dim=-1)

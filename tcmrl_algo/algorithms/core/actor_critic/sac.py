@@ -248,14 +248,15 @@ class SoftActorCritic(ActorCritic):
             }
         values = self.value(rows.inputs).squeeze(-1)
         state_value_loss = value_loss(values, targets)
+        seen = q_values.detach()
         total = critic_loss + state_value_loss + actor_loss + self._regularization(sample)
         metrics |= {
             "loss/critic": critic_loss,
             "loss/value": state_value_loss,
             "loss/policy": actor_loss,
-            "actor_critic/q": q_values.mean(),
-            LARGEST_Q: q_values.abs().amax(),
-            "actor_critic/policy_std": sample.log_std.exp().mean(),
+            "actor_critic/q": seen.mean(),
+            LARGEST_Q: seen.abs().amax(),
+            "actor_critic/policy_std": sample.log_std.detach().exp().mean(),
         }
         return total, metrics
 
