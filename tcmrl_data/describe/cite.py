@@ -5,7 +5,7 @@ import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import yaml
 
@@ -15,7 +15,6 @@ from tcmrl_data.recipe.recipe import load_recipe
 from tcmrl_data.store.manifest import Manifest
 
 CitationFormat = Literal["bibtex", "cff", "text"]
-FORMATS: tuple[CitationFormat, ...] = get_args(CitationFormat)
 
 UNKNOWN_AUTHORS = ("unknown",)
 """Of a work that names none; the Citation File Format asks for at least one."""
@@ -65,12 +64,12 @@ def citation_of(manifest: Manifest) -> Citation:
         licences=manifest.licences,
         url=manifest.recipe.about.url,
         doi=manifest.recipe.about.doi,
-        references=works_of(manifest),
+        references=_works_of(manifest),
         software=version("tcmrl"),
     )
 
 
-def works_of(manifest: Manifest) -> tuple[Reference, ...]:
+def _works_of(manifest: Manifest) -> tuple[Reference, ...]:
     """The works that the data are from: those of all runs.
 
     A dataset that names none, such as one of an earlier version, takes those of the installed recipe.

@@ -215,13 +215,7 @@ def _film(
 ) -> list[Frame]:
     """Films an episode; if it does not come back, says whether another platform may be the reason."""
     try:
-        return film(
-            dataset.environment,
-            episode,
-            frames=frames,
-            width=width,
-            progress=progress,
-        )
+        return film(dataset.environment, episode, frames=frames, width=width, progress=progress)
     except SimulationError as error:
         made_on = dataset.manifest.platforms[dataset.entry(episode.key).platform]
         here = this_platform(dataset.environment, dataset.manifest.recipe.behavior.source)

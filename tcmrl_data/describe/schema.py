@@ -5,7 +5,7 @@ when a file is read.
 """
 
 import typing
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 from pydantic import Field, TypeAdapter, create_model
 
@@ -17,7 +17,6 @@ from tcmrl_data.store.manifest import MANIFEST_SCHEMA, Manifest
 from tcmrl_data.store.part import PART_SCHEMA, PartRecord
 
 SchemaKind = Literal["manifest", "part", "recipe", "events"]
-KINDS: tuple[SchemaKind, ...] = get_args(SchemaKind)
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 

@@ -45,7 +45,7 @@ def render_page(
         lstrip_blocks=True,
         finalize=_finalized,
     )
-    environment.filters |= {"cell": cell_text, "data_url": data_url}
+    environment.filters |= {"cell": cell_text, "data_url": _data_url}
     return environment.get_template(template).render(
         values,
         title=title,
@@ -69,9 +69,9 @@ def cell_text(cell: Any) -> str:
     return cell if isinstance(cell, str) else str(cell)
 
 
-def data_url(content: bytes, kind: str = "image/png") -> str:
-    """The bytes of a file as an address that needs no network."""
-    return f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
+def _data_url(content: bytes) -> str:
+    """A PNG file as an address that needs no network."""
+    return f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def escaped(text: str) -> Markup:
