@@ -189,17 +189,19 @@ def cached_rows(
     folder = cache_folder()
     entry = folder / "rows" / entry_key(selection, dense=dense)
     with _named_cache(folder):
-        rows = _open_entry(entry, selection, dense)
+        rows = _open_entry(entry, selection, dense, checked=CHECKED_BYTES)
         if rows is not None:
             return rows
         make_folders(folder)
         with _writer_lock(folder, say):
-            rows = _open_entry(entry, selection, dense)  # another process may have decoded it meanwhile
+            rows = _open_entry(
+                entry, selection, dense, checked=CHECKED_BYTES
+            )  # another process may have decoded it meanwhile
             if rows is None:
                 if say:
                     say(f"decoding {selection.dataset.folder} into {entry}; this happens once")
                 _write_entry(folder, entry, selection, dense)
-                rows = _open_entry(entry, selection, dense)
+                rows = _open_entry(entry, selection, dense, checked=0)  # it was hashed just now
     if rows is None:
         raise CacheError(f"{entry} changed while it was written; run the same command again")
     return rows
@@ -229,15 +231,18 @@ def entry_bytes(selection: "Selection", *, dense: bool = False) -> int:
     return 4 * rows * width + 8 * sum(part.episodes for part in plan) + RECORD_BYTES
 
 
-def _open_entry(entry: Path, selection: "Selection", dense: bool) -> PackedRows | None:
-    """The rows of an entry, which is locked while its table is in use; None if it is missing or damaged."""
+def _open_entry(entry: Path, selection: "Selection", dense: bool, *, checked: int) -> PackedRows | None:
+    """The rows of an entry, which is locked while its table is in use; None if it is missing or damaged.
+
+    A file of up to `checked` bytes is hashed.
+    """
     with contextlib.ExitStack() as lock:
         try:
             file = lock.enter_context((entry / RECORD).open("rb"))
         except FileNotFoundError:
             return None
         take_shared_lock(file)  # whoever removes an entry holds the exclusive lock only briefly
-        if not is_current(file, entry / RECORD) or _problem(entry, limit=CHECKED_BYTES):
+        if not is_current(file, entry / RECORD) or _problem(entry, limit=checked):
             return None
         with contextlib.suppress(OSError):  # a cache that may only be read
             os.utime(entry / RECORD)
