@@ -4,6 +4,7 @@ import pytest
 from tcmrl_data.foundation.seeding import (
     Purpose,
     environment_key,
+    evenly_spread,
     keyed_generator,
     keyed_seed,
     keyed_sequence,
@@ -66,3 +67,12 @@ def test_purposes_keep_their_numbers() -> None:
         "TRANSFER_NOISE": 21,
         "VISIBILITY": 22,
     }
+
+
+def test_evenly_spread_items_have_both_ends() -> None:
+    items = list(range(15))
+    assert evenly_spread(items, 1) == [0]
+    assert evenly_spread(items, 3) == [0, 7, 14]
+    assert evenly_spread(items, 4) == [0, 5, 9, 14]
+    assert evenly_spread(items, 99) == items
+    assert evenly_spread([], 3) == []

@@ -189,14 +189,6 @@ def test_a_replay_makes_the_same_bits_and_notices_others(
     assert "actions differ at step 0" in problems[0]
 
 
-def test_replays_are_spread_over_the_dataset() -> None:
-    keys = [PartKey(task, step) for task in range(5) for step in range(3)]
-    assert replay_module.spread_parts(keys, 1) == [PartKey(0, 0)]
-    assert replay_module.spread_parts(keys, 3) == [PartKey(0, 0), PartKey(2, 1), PartKey(4, 2)]
-    assert replay_module.spread_parts(keys, 99) == keys
-    assert replay_module.spread_parts([], 3) == []
-
-
 def test_all_damages_are_found_at_once(tiny_copy: Copy) -> None:
     folder = tiny_copy()
     shutil.rmtree(folder / part_folder(PartKey(0, 0)))

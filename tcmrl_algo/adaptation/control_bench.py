@@ -20,6 +20,7 @@ from tcmrl_data import (
     first_observation,
     hidden_entries,
 )
+from tcmrl_data.foundation.seeding import evenly_spread
 
 TEST_EPISODES = 5
 """Episodes per policy and test task; one per policy and training task choose the fixed policies."""
@@ -83,7 +84,6 @@ class ControlBench:
         them are compared in all.
         """
         training = self.dataset.train_tasks
-        chosen = np.linspace(0, len(training) - 1, min(SCREENING_TASKS, len(training))).round().astype(int)
         found = {
             key: control
             for task in training
@@ -92,7 +92,7 @@ class ControlBench:
         }
         if not found:
             return None, None
-        screening = [training[place] for place in chosen]
+        screening = evenly_spread(training, SCREENING_TASKS)
         means = {key: fmean(self.returns(screening, control, 1)) for key, control in found.items()}
         average = fmean(means.values())
         if len(training) > SCREENING_TASKS:

@@ -19,6 +19,7 @@ from tcmrl_algo.training.config import method_of
 from tcmrl_algo.training.metrics import log_evaluation
 from tcmrl_algo.training.train import create_algorithm
 from tcmrl_data import Dataset, Task, TrainingError, Trajectory
+from tcmrl_data.foundation.seeding import evenly_spread
 
 MOST_OTHERS = 3
 """Most other tasks whose contexts are tried on a task; a single one may be very similar or dissimilar."""
@@ -205,8 +206,7 @@ def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) 
         others = foreign(
             [arena.stored(other, draw=draw) for draw in range(num_own)] for other in arena.dataset.train_tasks
         )
-    spread = np.linspace(0, len(others) - 1, min(MOST_OTHERS, len(others))).round().astype(int)
-    chosen = [others[index] for index in spread]
+    chosen = evenly_spread(others, MOST_OTHERS)
     lanes = range(max(num_own, len(chosen)))
     return [chosen[lane % len(chosen)][lane // len(chosen)] for lane in lanes]
 

@@ -15,6 +15,7 @@ from tcmrl_algo.reporting.sources import FinishedRun
 from tcmrl_algo.training.checkpoint import open_run
 from tcmrl_algo.training.train import create_algorithm
 from tcmrl_data import CheckpointError, Dataset, Task, Trajectory, open_dataset
+from tcmrl_data.foundation.seeding import evenly_spread
 
 NUM_TASKS = 20
 """Number of tasks, as in the paper's t-SNE figures (Appendix G.7)."""
@@ -49,11 +50,11 @@ class Stored:
     def __init__(self, dataset: Dataset, snapshots: str) -> None:
         tasks = sorted((*dataset.train_tasks, *dataset.test_tasks), key=lambda task: task.index)
         self.dataset = dataset
-        self.tasks: list[Task] = [tasks[index] for index in _spaced(len(tasks), NUM_TASKS)]
+        self.tasks: list[Task] = evenly_spread(tasks, NUM_TASKS)
         self.trajectories: list[list[Trajectory]] = []
         for task in self.tasks:
             found = dataset.select(tasks=[task.index], snapshots=snapshots).trajectories(task.index)
-            self.trajectories.append([found[index] for index in _spaced(len(found), PER_TASK)])
+            self.trajectories.append(evenly_spread(found, PER_TASK))
 
     @property
     def lanes(self) -> list[list[Trajectory]]:
@@ -230,7 +231,3 @@ def _transition_weights(rows: Sequence[FloatArray], stored: Stored) -> Transitio
         example=rows[example],
         example_rewards=np.asarray(trajectories[example].rewards),
     )
-
-
-def _spaced(length: int, most: int) -> list[int]:
-    return [int(index) for index in np.linspace(0, length - 1, min(length, most)).round()]

@@ -4,7 +4,7 @@ import contextlib
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -45,8 +45,6 @@ RETURN_ERRORS = 4.0
 episode must agree to 1e-3 (absolute, or relative to the larger value), and the mean return must lie within 4
 standard errors of the difference of two such means."""
 
-Item = TypeVar("Item")
-
 
 @dataclass(frozen=True)
 class Replay:
@@ -68,12 +66,6 @@ class Replay:
     def exact(self) -> bool:
         """Whether every bit was compared."""
         return not self.platform_differences
-
-
-def spread_parts(keys: Sequence[Item], number: int) -> list[Item]:
-    """At most `number` of some parts, evenly spread over all, the first and the last among them."""
-    positions = np.linspace(0, len(keys) - 1, min(number, len(keys))).round().astype(int)
-    return [keys[position] for position in positions]
 
 
 def replay_part(

@@ -19,6 +19,7 @@ from tcmrl_data.foundation.disk import LOCK, lock_holder
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, words_after
+from tcmrl_data.foundation.seeding import evenly_spread
 from tcmrl_data.parts.operation import can_be_made_again
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.keys import PARTS, key_of_file, part_file
@@ -49,7 +50,6 @@ from tcmrl_data.verification.replay import (
     derived_problems,
     files_of_parts,
     replay_part,
-    spread_parts,
 )
 
 
@@ -171,7 +171,7 @@ class _Verification:
             for file in unnamed:
                 self._add(file, _unnamed(file, manifest), foreign=True)
         checks = PartChecks(self._folder, self._level, self._description)
-        opened = set(spread_parts([*entries], len(entries) if self._sample is None else self._sample))
+        opened = set(evenly_spread([*entries], len(entries) if self._sample is None else self._sample))
 
         def check(file: str, entry: PartEntry | None) -> list[str]:
             return list(checks.problems(file, self.scan.files.get(file), entry, opened=file in opened))
@@ -205,7 +205,7 @@ class _Verification:
         keys = [key for key in self._description.table if part_file(key) not in bad and key.run in recipes]
         files = files_of_parts(self._folder, self._description.table, bad=bad) if number else {}
         replays = []
-        for key in spread_parts(keys, number):
+        for key in evenly_spread(keys, number):
             file = self._folder / part_file(key)
             try:
                 with Archive(file) as archive:
