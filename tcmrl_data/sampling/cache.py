@@ -194,9 +194,8 @@ def cached_rows(
             return rows
         make_folders(folder)
         with _writer_lock(folder, say):
-            rows = _open_entry(
-                entry, selection, dense, checked=CHECKED_BYTES
-            )  # another process may have decoded it meanwhile
+            # another process may have decoded it meanwhile
+            rows = _open_entry(entry, selection, dense, checked=CHECKED_BYTES)
             if rows is None:
                 if say:
                     say(f"decoding {selection.dataset.folder} into {entry}; this happens once")

@@ -101,12 +101,8 @@ class Sampler:
 
     Args:
         rows: the packed selection.
-        request: the content of a batch.
-        seed: seed of the run.
-        stream: number of the stream; streams with the same seed are independent.
         environment: the environment's name, part of the seed's key.
         place: name of the selection in error messages.
-        device: a torch device.
 
     Raises:
         SelectionError: a task has too few steps, trajectories or windows for the request, or the request
@@ -204,13 +200,7 @@ class Sampler:
         return self._gather(self._draws(n))
 
     def prefetch(self, first: int, last: int, *, depth: int = 2) -> "Prefetch[Batch]":
-        """An iterator over batches `first` to `last - 1`, made ahead by a thread; a context manager.
-
-        Args:
-            first: number of the first batch.
-            last: number of the last batch + 1.
-            depth: maximum number of batches made ahead; 0 makes a batch when it is needed.
-        """
+        """An iterator over batches `first` to `last - 1`, made ahead by a thread; see `Prefetch`."""
         return Prefetch(self.batch, range(first, last), depth=depth)
 
     def moments(self) -> Moments:
