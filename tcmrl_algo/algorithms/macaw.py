@@ -195,12 +195,8 @@ class MacawNetworks(nn.Module):
 
     def __init__(self, problem: Problem, config: MacawConfig, *, generator: torch.Generator) -> None:
         super().__init__()
-        states, actions, hidden, code = (
-            problem.observation_dim,
-            problem.action_dim,
-            config.hidden,
-            config.code,
-        )
+        states, actions = problem.observation_dim, problem.action_dim
+        hidden, code = config.hidden, config.code
         self.scaling = Standardizer(problem.observation_mean, problem.observation_std)
         self.value = WeightPerceptron((states, *hidden, 1), code=code, generator=generator)
         self.policy = WeightPerceptron((states, *hidden, actions), code=code, generator=generator)

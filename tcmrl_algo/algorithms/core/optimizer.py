@@ -131,7 +131,7 @@ def _descend(memories: Sequence[_Memory], rate: float) -> None:
     counts = {steps: torch.tensor(float(steps), device=device) for steps in {one.steps for one in memories}}
     torch._fused_adam_(
         [memory.parameter for memory in memories],
-        [memory.parameter.grad for memory in memories],
+        [gradient for memory in memories if (gradient := memory.parameter.grad) is not None],
         [memory.average for memory in memories],
         [memory.square for memory in memories],
         [],
