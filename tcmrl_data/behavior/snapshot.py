@@ -157,7 +157,10 @@ def _read_tensors(
     file = f"{place}: policy.safetensors"
     weights = sum(int(np.prod(shape)) for shape in shapes.values())
     try:
-        tensors = load(read("policy.safetensors", limit=4 * weights + HEADER_BYTES))
+        data = read("policy.safetensors", limit=4 * weights + HEADER_BYTES)
+        if len(data) < 4 * weights:
+            raise SnapshotError(f"{file}: {len(data)} bytes, the policy needs {4 * weights}")
+        tensors = load(data)
     except (OSError, ValueError, KeyError, TypeError, StoreError, SafetensorError) as error:
         raise SnapshotError(f"{file}: cannot be read as safetensors ({one_line(error)})") from None
     found = {name: array.shape for name, array in tensors.items()}

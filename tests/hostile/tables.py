@@ -181,8 +181,8 @@ PART_TABLES = [
     _parts("platform that is none", _cell("platform", 1), "platform", "verify"),
     _parts("mean as text", _cell("mean", "high"), "0.9"),
     _parts("oracle as text", _cell("oracle", "high"), "0.15"),
-    _parts("part of no task", lambda f: f.rows(TASKS, lambda rows: rows.pop()), "names a task", "verify"),
-    _parts("of no task at all", _sealed(TASKS, lambda data: b""), "names a task", "verify"),
+    _parts("part of no task", lambda f: f.rows(TASKS, lambda rows: rows.pop()), "names a task"),
+    _parts("of no task at all", _sealed(TASKS, lambda data: b""), "names a task"),
 ]
 
 PLACES = [
