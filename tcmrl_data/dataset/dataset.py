@@ -120,10 +120,14 @@ class Dataset:
         """The tasks of the table, dropped ones too, ascending by index.
 
         Raises:
-            ManifestError: the table of tasks is not the one that the manifest seals.
+            ManifestError: the table of tasks is not the one that the manifest seals, or has none of those of
+                the parts.
         """
         file = self.folder / TASKS
-        return parse_tasks(read_sealed(file, self.manifest.tasks), file)
+        tasks = parse_tasks(read_sealed(file, self.manifest.tasks), file)
+        if not tasks and self.manifest.parts.lines:
+            raise ManifestError(f"{self.folder / PARTS_TABLE}: names a task that {TASKS} does not have")
+        return tasks
 
     @functools.cached_property
     def recorded_parts(self) -> PartTable:
