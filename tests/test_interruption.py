@@ -28,10 +28,12 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
 
 @pytest.fixture
 def as_in_a_program() -> Any:
-    """Ctrl-C raises KeyboardInterrupt, even if the tests run in the background."""
+    """Ctrl-C raises KeyboardInterrupt and SIGHUP ends, even if the tests run in the background or by nohup."""
     earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
+    hanging_up = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield
     signal.signal(signal.SIGINT, earlier)
+    signal.signal(signal.SIGHUP, hanging_up)
 
 
 def interrupt_at(step: int) -> Callable[[TrainingProgress], None]:
@@ -87,6 +89,7 @@ def test_a_run_killed_before_its_first_checkpoint_says_that_it_begins_anew(
 
 
 @pytest.mark.check
+@pytest.mark.usefixtures("as_in_a_program")
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_the_command_that_an_interrupted_training_prints_goes_on(
     tiny_folder: Path, tmp_path: Path, call: Call, number: signal.Signals
