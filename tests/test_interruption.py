@@ -28,7 +28,7 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
 
 @pytest.fixture
 def as_in_a_program() -> Any:
-    """Ctrl-C raises KeyboardInterrupt and SIGHUP ends, even if the tests run in the background or by nohup."""
+    """Ctrl-C raises KeyboardInterrupt and SIGHUP ends, even if the tests run by nohup."""
     earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
     hanging_up = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     yield

@@ -1,6 +1,5 @@
 """Builds that go on where numbers are rounded differently, as emulated in processes without AVX-512."""
 
-import functools
 import json
 import os
 import subprocess
@@ -12,8 +11,6 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, load_recipe, open_dataset, verify_dataset
-from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.building import unit
 from tcmrl_data.building.events import EVENTS
 from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK
@@ -56,17 +53,18 @@ def test_a_finished_dataset_is_left_alone_on_another_platform(tiny_copy: Callabl
 
 
 @pytest.fixture
-def half_built(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def half_built(tmp_path: Path) -> Path:
     """A build that ended after the second of three parts, with a checkpoint behind the first."""
 
     def kill(event: BuildEvent) -> None:
         if event.kind == "part" and event.parts_done == 2:
             raise Killed
 
-    monkeypatch.setattr(unit, "CheckpointFolder", functools.partial(CheckpointFolder, seconds=0.0))
     recipe, out = load_recipe("point-robot", profile="quick", overrides=TINY), tmp_path / "data"
     with pytest.raises(Killed):
-        tcmrl_data.build_dataset(recipe, out, tasks=[0], engine=InProcessEngine(), progress=kill)
+        tcmrl_data.build_dataset(
+            recipe, out, tasks=[0], engine=InProcessEngine(), checkpoint_seconds=0.0, progress=kill
+        )
     assert len(list((out / CHECKPOINTS).rglob("*.safetensors"))) == 1
     return out
 
