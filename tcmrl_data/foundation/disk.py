@@ -110,12 +110,6 @@ def write_tree(folder: Path, files: Mapping[str, bytes]) -> None:
             disk.sync(path)
 
 
-def sync_tree(folder: Path) -> None:
-    """Forces a folder and everything below it to disk, for files written by a library."""
-    for path in sorted([folder, *folder.rglob("*")], reverse=True):
-        disk.sync(path)
-
-
 def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> None:
     """Replaces a file atomically: readers see the old content or the new content.
 
