@@ -2,6 +2,7 @@
 
 import fcntl
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -120,12 +121,14 @@ def test_a_killed_writer_leaves_no_lock(tmp_path: Path) -> None:
     assert lock_holder(lock) is None
 
 
-def test_status_of_a_dataset_that_can_only_be_read(tiny_folder: Path) -> None:
-    with lock_file(tiny_folder / LOCK, "dataset"):
-        result = run_mounted(read_only(tiny_folder), "status", tiny_folder, "--json")
+def test_status_of_a_dataset_that_can_only_be_read(tiny_folder: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "data"  # other tests lock the shared one
+    shutil.copytree(tiny_folder, folder)
+    with lock_file(folder / LOCK, "dataset"):
+        result = run_mounted(read_only(folder), "status", folder, "--json")
     assert result.returncode == 0, result.stderr
     assert f"process {os.getpid()} on " in result.stdout
-    assert build_status(tiny_folder).builder is None
+    assert build_status(folder).builder is None
 
 
 def test_without_open_file_locks_a_question_delays_a_writer_and_does_not_refuse_it(
