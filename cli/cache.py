@@ -69,9 +69,8 @@ def list_(as_json: bool, quiet: bool) -> None:
 def verify(as_json: bool, quiet: bool) -> None:
     """Hash all entries, and remove those that are damaged.
 
-    A run that opens an entry checks that no program changed it, and hashes it if it takes up to 1 GB.
-    This command hashes larger entries too, and so finds damage of the disk. The exit code is 1 if an
-    entry is damaged; the next run that needs it decodes it again.
+    A run that opens an entry hashes it if it takes up to 1 GB; this command hashes larger entries too. The
+    exit code is 1 if an entry is damaged; the next run that needs it decodes it again.
 
     \b
     Example:

@@ -96,12 +96,12 @@ from .sampling.cache import cache_limit as cache_limit
 from .sampling.cache import clear_cache as clear_cache
 from .sampling.cache import list_cache as list_cache
 from .sampling.cache import verify_cache as verify_cache
+from .sampling.draws import BatchRequest as BatchRequest
+from .sampling.draws import Trajectories as Trajectories
+from .sampling.draws import Transitions as Transitions
+from .sampling.draws import Windows as Windows
 from .sampling.gather import Batch as Batch
 from .sampling.gather import Steps as Steps
-from .sampling.request import BatchRequest as BatchRequest
-from .sampling.request import Trajectories as Trajectories
-from .sampling.request import Transitions as Transitions
-from .sampling.request import Windows as Windows
 from .sampling.rows import Moments as Moments
 from .sampling.sampler import Prefetch as Prefetch
 from .sampling.sampler import Sampler as Sampler

@@ -31,8 +31,9 @@ from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
 from tcmrl_data.foundation.errors import CacheError, ManifestError, StoreError
 from tcmrl_data.foundation.records import sealed
 from tcmrl_data.sampling import cache
-from tcmrl_data.sampling.cache import RECORD_BYTES, cached_rows, load_rows
+from tcmrl_data.sampling.cache import RECORD_BYTES, cached_rows
 from tcmrl_data.sampling.rows import Indices, PartRows, Table, fill_table, read_rows
+from tcmrl_data.sampling.sampler import load_rows
 from tcmrl_data.store.archive import pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays
 from tcmrl_data.store.keys import PartKey
@@ -84,7 +85,7 @@ def test_the_limit_decides(selection: Selection, folder: Path, monkeypatch: pyte
     size = read_rows(selection).table.nbytes
     load_rows(selection, memory_limit=size)
     assert not folder.exists()
-    monkeypatch.setattr(cache, "available_memory", lambda: 2 * size - 2)
+    monkeypatch.setattr("tcmrl_data.sampling.sampler.available_memory", lambda: 2 * size - 2)
     load_rows(selection)
     assert len(entries(folder)) == 1
 
@@ -147,44 +148,21 @@ def forge(copy: Path, *, claim: str) -> Path:
     return copy
 
 
-@pytest.mark.parametrize(
-    ("file", "damage"),
-    [*((file, damage) for file in ("record.json", "rows.bin") for damage in ("cut", "missing", "flipped"))],
-)
-def test_a_torn_entry_is_made_again(selection: Selection, folder: Path, file: str, damage: str) -> None:
+@pytest.mark.parametrize("damage", ["cut", "empty", "record", "table", "lengths"])
+def test_a_torn_entry_is_made_again(selection: Selection, folder: Path, damage: str) -> None:
     rows = cached_rows(selection)
     expected, lengths = np.array(rows.table), rows.episodes.lengths
     del rows
     (entry,) = entries(folder)
-    content = (entry / file).read_bytes()
-    if damage == "missing":
-        (entry / file).unlink()
+    content = bytearray(entry.read_bytes())
+    if damage in ("cut", "empty"):
+        entry.write_bytes(content[:-4] if damage == "cut" else b"")
     else:
-        flipped = content[:-9] + bytes([content[-9] ^ 1]) + content[-8:]
-        (entry / file).write_bytes(content[:-4] if damage == "cut" else flipped)
+        content[{"record": 0, "table": RECORD_BYTES, "lengths": -8}[damage]] ^= 1
+        entry.write_bytes(content)
     again = cached_rows(selection)
     np.testing.assert_array_equal(again.table, expected)
     np.testing.assert_array_equal(again.episodes.lengths, lengths)
-    if file != "record.json":  # it holds the time of the new file
-        assert (entries(folder)[0] / file).read_bytes() == content
-
-
-def test_a_large_file_that_was_changed_is_hashed(
-    selection: Selection, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One byte of a length, with the old time of writing; a file that was not changed is not hashed."""
-    monkeypatch.setattr(cache, "CHECKED_BYTES", 0)
-    cached_rows(selection)
-    table = entries(folder)[0] / "rows.bin"
-    before = table.stat()
-    with monkeypatch.context() as patch:
-        patch.setattr(cache, "_digest_of", lambda file: pytest.fail("hashed"))
-        cached_rows(selection)
-    with table.open("r+b") as file:
-        file.seek(-1, os.SEEK_END)
-        file.write(b"\1")
-    os.utime(table, ns=(before.st_atime_ns, before.st_mtime_ns))
-    np.testing.assert_array_equal(cached_rows(selection).table, read_rows(selection).table)
 
 
 def test_a_copied_cache_is_used(
@@ -232,10 +210,10 @@ def test_what_was_used_longest_ago_goes_first(tiny: Dataset, monkeypatch: pytest
     for age, selection in enumerate((old, older)):
         cached_rows(selection)
         key = next(entry.key for entry in list_cache() if entry.used > 2000)
-        os.utime(cache.cache_folder() / "rows" / key / "record.json", (1000 + age, 1000 + age))
+        os.utime(cache.cache_folder() / "rows" / f"{key}.bin", (1000 + age, 1000 + age))
     cached_rows(old)
     first, second = list_cache()
-    monkeypatch.setenv("TCMRL_CACHE_LIMIT", str(first.bytes + second.bytes + RECORD_BYTES))
+    monkeypatch.setenv("TCMRL_CACHE_LIMIT", str(first.bytes + second.bytes))
     cached_rows(new)
     left = {entry.key for entry in list_cache()}
     assert len(left) == 2 and first.key not in left and second.key in left
@@ -315,27 +293,20 @@ def test_list_and_clear_commands(
     assert not entries(folder)
 
 
-def test_verify_finds_what_the_disk_damaged_and_opening_does_not(
+def test_verify_finds_damage_of_large_entries_that_opening_does_not(
     selection: Selection, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Damage of the disk changes no time; here the record says that the damaged file is the sealed one."""
     monkeypatch.setattr(cache, "CHECKED_BYTES", 0)
     call: Call = in_process(data, capsys)
     rows = cached_rows(selection)
     (entry,) = entries(folder)
     assert json.loads(call("cache", "verify", "--json")[1]) == {"checked": 1, "damaged": []}
-    content = bytearray((entry / "rows.bin").read_bytes())
-    content[0] ^= 1
-    (entry / "rows.bin").write_bytes(content)
-    record = json.loads((entry / "record.json").read_bytes())
-    record["changed"] = (entry / "rows.bin").stat().st_ctime_ns
-    (entry / "record.json").write_text(json.dumps(record))
-    assert content.startswith(cached_rows(selection).table.tobytes())
+    content = bytearray(entry.read_bytes())
+    content[RECORD_BYTES] ^= 1
+    entry.write_bytes(content)
+    assert content[RECORD_BYTES:].startswith(cached_rows(selection).table.tobytes())
     code, output, errors = call("cache", "verify")
-    assert (
-        code == 1
-        and "the bytes of rows.bin are not those that were written; kept, because it is in use" in output
-    )
+    assert code == 1 and "its bytes are not those that were written; kept, because it is in use" in output
     assert errors == "Error: 1 of 1 entries are damaged\n"
     del rows
     damaged = json.loads(call("cache", "verify", "--json")[1])["damaged"]

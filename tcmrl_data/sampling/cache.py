@@ -1,18 +1,18 @@
 """The cache of decoded steps, for selections that do not fit into memory.
 
-An entry is a folder `<cache>/rows/<key>`; its key is a digest of the selected parts' ids, and every array is
-checked against its part's record while it is decoded, so that a forged dataset cannot take the place of
-another. `rows.bin` holds the table of packed rows, which is mapped into memory, and behind it the length of
-every episode. `record.json` holds the file's digest. An entry is written once, forced to disk, published by
-one rename, and never changes.
+An entry is one file `<cache>/rows/<key>.bin`; its key is a digest of the selected parts' ids, and every array
+is checked against its part's record while it is decoded, so that a forged dataset cannot take the place of
+another. The file holds a record with the digest of all that follows it, the table of packed rows, which is
+mapped into memory, and the length of every episode. It is written once, forced to disk, published by one
+rename, and never changes.
 
 One process writes at a time, under the cache's lock; others wait. Before it writes, the least recently used
-entries are removed until all fit below TCMRL_CACHE_LIMIT. A reader holds a shared lock on its entry's record,
-so that no entry in use is removed.
+entries are removed until all fit below TCMRL_CACHE_LIMIT. A reader holds a shared lock on its entry, so that
+no entry in use is removed.
 
-A file of up to CHECKED_BYTES is hashed whenever it is opened, and so is every file that changed since it was
-written. `tcmrl-data cache verify` hashes all. Nothing here guards against a person who may write to the
-cache's folder and forges a whole entry: give write access only to those who are trusted.
+A file of up to CHECKED_BYTES is hashed whenever it is opened; `tcmrl-data cache verify` hashes all. Nothing
+here guards against a person who may write to the cache's folder: give write access only to those who are
+trusted.
 """
 
 import contextlib
@@ -24,7 +24,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, BinaryIO
 
 import numpy as np
 from pydantic import ValidationError
@@ -39,11 +39,10 @@ from tcmrl_data.foundation.disk import (
     make_folders,
     move_into_place,
     remove_tree,
-    write_file,
 )
 from tcmrl_data.foundation.errors import CacheError, LockedError, StorageError
 from tcmrl_data.foundation.locks import is_locked, take_shared_lock, try_exclusive_lock
-from tcmrl_data.foundation.machine import available_cores, available_memory, parse_bytes, size
+from tcmrl_data.foundation.machine import available_cores, parse_bytes, size
 from tcmrl_data.foundation.plain_files import one_line, printable
 from tcmrl_data.foundation.records import Record, record_bytes
 from tcmrl_data.sampling.rows import (
@@ -53,7 +52,6 @@ from tcmrl_data.sampling.rows import (
     fill_table,
     pack_rows,
     plan_rows,
-    read_rows,
     row_arrays,
     table_shape,
 )
@@ -67,11 +65,11 @@ CACHE_BYTES = 100 * 10**9
 CHECKED_BYTES = 10**9
 """A file up to this size is hashed whenever it is opened, which takes about a second on one core."""
 
-FORMAT = 3
+FORMAT = 4
 """Part of every key; increased when the layout of an entry changes."""
 
 RECORD_BYTES = 2**13
-"""More than a record takes."""
+"""What the record takes at the beginning of a file, filled up with spaces."""
 
 PIECE_BYTES = 2**22
 """Files are hashed in pieces of this size, several at a time."""
@@ -79,15 +77,13 @@ PIECE_BYTES = 2**22
 WAIT_SECONDS = 0.2
 """Interval at which a process that waits for the lock tries again."""
 
-ROWS, RECORD = "rows.bin", "record.json"
-
 
 @dataclass(frozen=True)
 class CacheEntry:
     """An entry of the cache.
 
     Attributes:
-        key: name of its folder.
+        key: name of its file, without `.bin`.
         environment: name of the dataset's environment; empty if the entry is damaged.
         dataset: folder that it was decoded from; equal parts elsewhere share the entry. Empty if damaged.
         tasks: number of selected tasks.
@@ -108,18 +104,12 @@ class CacheEntry:
 
 
 class EntryRecord(Record):
-    """The file `record.json` of an entry.
-
-    Attributes:
-        changed: time of the last change of `rows.bin` in nanoseconds (ctime), which no program can set back.
-        digest: of `rows.bin`; see `_digest_of`.
-    """
+    """The beginning of an entry's file; `digest` is that of what follows, see `_digest_of`."""
 
     environment: str
     dataset: str
     tasks: int
     parts: int
-    changed: int
     digest: str
 
 
@@ -137,35 +127,6 @@ def cache_limit() -> int:
     """
     text = os.environ.get("TCMRL_CACHE_LIMIT")
     return parse_bytes(text) if text else CACHE_BYTES
-
-
-def load_rows(
-    selection: "Selection",
-    *,
-    dense: bool = False,
-    memory_limit: int | None = None,
-    say: Callable[[str], None] | None = None,
-) -> PackedRows:
-    """Loads the rows of a selection into memory, or from the cache if they do not fit.
-
-    Args:
-        selection: the selection.
-        dense: load dense rewards too.
-        memory_limit: maximum size of the rows in memory, in bytes; None for half of the available memory.
-        say: called with a message if the cache is used.
-
-    Raises:
-        TcmrlError: as `read_rows` or `cached_rows` does.
-    """
-    rows, width = table_shape(selection, plan_rows(selection, dense=dense))
-    needed = 4 * rows * width
-    limit = available_memory() // 2 if memory_limit is None else memory_limit
-    if needed <= limit:
-        return read_rows(selection, dense=dense)
-    if say:
-        why = "half of the available memory" if memory_limit is None else "the memory limit"
-        say(f"{size(needed)} of steps exceed {why}, {size(limit)}: using the cache")
-    return cached_rows(selection, dense=dense, say=say)
 
 
 def cached_rows(
@@ -187,15 +148,14 @@ def cached_rows(
             names; the message names the part.
     """
     folder = cache_folder()
-    entry = folder / "rows" / entry_key(selection, dense=dense)
+    entry = _file_of(entry_key(selection, dense=dense))
     with _named_cache(folder):
-        rows = _open_entry(entry, selection, dense, checked=CHECKED_BYTES)
+        rows = _open_entry(entry, selection, dense)
         if rows is not None:
             return rows
         make_folders(folder)
         with _writer_lock(folder, say):
-            # another process may have decoded it meanwhile
-            rows = _open_entry(entry, selection, dense, checked=CHECKED_BYTES)
+            rows = _open_entry(entry, selection, dense)  # another process may have decoded it meanwhile
             if rows is None:
                 if say:
                     say(f"decoding {selection.dataset.folder} into {entry}; this happens once")
@@ -224,39 +184,47 @@ def entry_key(selection: "Selection", *, dense: bool = False) -> str:
 
 
 def entry_bytes(selection: "Selection", *, dense: bool = False) -> int:
-    """The most that a selection's entry takes on disk, in bytes."""
+    """The size of a selection's entry on disk."""
     plan = plan_rows(selection, dense=dense)
     rows, width = table_shape(selection, plan)
-    return 4 * rows * width + 8 * sum(part.episodes for part in plan) + RECORD_BYTES
+    return RECORD_BYTES + 4 * rows * width + 8 * sum(part.episodes for part in plan)
 
 
-def _open_entry(entry: Path, selection: "Selection", dense: bool, *, checked: int) -> PackedRows | None:
+def _file_of(key: str) -> Path:
+    return cache_folder() / "rows" / f"{key}.bin"
+
+
+def _open_entry(
+    entry: Path, selection: "Selection", dense: bool, *, checked: int | None = None
+) -> PackedRows | None:
     """The rows of an entry, which is locked while its table is in use; None if it is missing or damaged.
 
-    A file of up to `checked` bytes is hashed.
+    A file of up to `checked` bytes is hashed, by default of up to CHECKED_BYTES.
     """
     with contextlib.ExitStack() as lock:
         try:
-            file = lock.enter_context((entry / RECORD).open("rb"))
+            file = lock.enter_context(entry.open("rb"))
         except FileNotFoundError:
             return None
         take_shared_lock(file)  # whoever removes an entry holds the exclusive lock only briefly
-        if not is_current(file, entry / RECORD) or _problem(entry, limit=checked):
+        limit = CHECKED_BYTES if checked is None else checked
+        is_whole = os.fstat(file.fileno()).st_size == entry_bytes(selection, dense=dense)
+        if not is_current(file, entry) or not is_whole or _problem(file, limit=limit):
             return None
         with contextlib.suppress(OSError):  # a cache that may only be read
-            os.utime(entry / RECORD)
+            os.utime(entry)
         plan = plan_rows(selection, dense=dense)
         shape = table_shape(selection, plan)
         # copy on write, because torch requires writable memory and the file must not change
-        table: Table = np.memmap(entry / ROWS, dtype=np.float32, mode="c", shape=shape)
-        lengths = np.fromfile(entry / ROWS, dtype=np.int64, offset=table.nbytes)
+        table: Table = np.memmap(entry, dtype=np.float32, mode="c", offset=RECORD_BYTES, shape=shape)
+        lengths = np.fromfile(entry, dtype=np.int64, offset=RECORD_BYTES + table.nbytes)
         weakref.finalize(table, lock.pop_all().close)
         return pack_rows(selection, plan, table, lengths)
 
 
 def _write_entry(folder: Path, entry: Path, selection: "Selection", dense: bool) -> None:
-    """Decodes a selection part by part into a staged folder, and publishes it; called by the only writer."""
-    if entry.is_dir() and not _remove(entry):
+    """Decodes a selection part by part into a staged file, and publishes it; called by the only writer."""
+    if entry.exists() and not _remove(entry):
         raise CacheError(
             f"{entry} is damaged, and another process reads it; stop that process, then run the same command "
             "again"
@@ -264,90 +232,86 @@ def _write_entry(folder: Path, entry: Path, selection: "Selection", dense: bool)
     remove_tree(folder / STAGING)  # what a killed process left
     _make_room(folder, entry_bytes(selection, dense=dense))
     staged = folder / STAGING / entry.name
-    make_folders(staged)
+    make_folders(staged.parent)
     make_folders(entry.parent)
     try:
         plan = plan_rows(selection, dense=dense)
         shape = table_shape(selection, plan)
-        with (staged / ROWS).open("xb") as file:  # reserves blocks: in the map, a full disk ends the process
-            os.posix_fallocate(file.fileno(), 0, 4 * shape[0] * shape[1])
-        lengths = fill_table(
-            np.memmap(staged / ROWS, dtype=np.float32, mode="r+", shape=shape), plan, check_digests=True
-        )
-        with (staged / ROWS).open("ab") as file:
+        with staged.open("xb") as file:  # reserves blocks: in the map, a full disk ends the process
+            os.posix_fallocate(file.fileno(), 0, entry_bytes(selection, dense=dense))
+        table = np.memmap(staged, dtype=np.float32, mode="r+", offset=RECORD_BYTES, shape=shape)
+        lengths = fill_table(table, plan, check_digests=True)
+        with staged.open("r+b") as file:
+            file.seek(RECORD_BYTES + table.nbytes)
             file.write(lengths.tobytes())
-        disk.sync(staged / ROWS)
-        record = EntryRecord(
-            environment=selection.dataset.name,
-            dataset=printable(str(selection.dataset.folder.resolve())),
-            tasks=len(selection.tasks),
-            parts=len(plan),
-            changed=(staged / ROWS).stat().st_ctime_ns,
-            digest=_digest_of(staged / ROWS),
-        )
-        write_file(staged / RECORD, record_bytes(record))
+            file.flush()
+            record = EntryRecord(
+                environment=selection.dataset.name,
+                dataset=printable(str(selection.dataset.folder.resolve())),
+                tasks=len(selection.tasks),
+                parts=len(plan),
+                digest=_digest_of(file),
+            )
+            file.seek(0)
+            file.write(record_bytes(record).ljust(RECORD_BYTES))
         disk.sync(staged)
         move_into_place(staged, entry)
     finally:
         remove_tree(folder / STAGING)
 
 
-def _read_record(entry: Path) -> EntryRecord | None:
-    """An entry's record; None if it is missing, damaged, or of another format."""
+def _read_record(file: BinaryIO) -> EntryRecord | None:
+    """An entry's record; None if it is damaged, or of another format."""
     try:
-        return EntryRecord.model_validate_json((entry / RECORD).read_bytes())
-    except (FileNotFoundError, ValidationError):
+        return EntryRecord.model_validate_json(os.pread(file.fileno(), RECORD_BYTES, 0))
+    except ValidationError:
         return None
 
 
-def _problem(entry: Path, *, limit: int | None = None) -> str | None:
+def _problem(file: BinaryIO, *, limit: int | None = None) -> str | None:
     """Why an entry is damaged, in words; None if nothing is found.
 
     Args:
-        entry: its folder.
-        limit: a file above this size, in bytes, is not hashed unless it changed; None hashes every file.
+        file: the entry, opened.
+        limit: a file above this size, in bytes, is not hashed; None hashes every file.
     """
-    record = _read_record(entry)
+    record = _read_record(file)
     if record is None:
-        return f"{RECORD} is damaged, or of another version"
+        return "its record is damaged, or of another version"
+    if limit is not None and os.fstat(file.fileno()).st_size > limit:
+        return None
     try:
-        status = (entry / ROWS).stat()
-        if limit is not None and status.st_size > limit and status.st_ctime_ns == record.changed:
-            return None
-        is_same = _digest_of(entry / ROWS) == record.digest
+        is_same = _digest_of(file) == record.digest
     except OSError as error:
-        return f"{ROWS} cannot be read ({one_line(error)})"
-    return None if is_same else f"the bytes of {ROWS} are not those that were written"
+        return f"it cannot be read ({one_line(error)})"
+    return None if is_same else "its bytes are not those that were written"
 
 
-def _digest_of(file: Path) -> str:
-    """The sha256 of the sha256 of a file's pieces, which several threads hash."""
-    with file.open("rb", buffering=0) as data, ThreadPoolExecutor(min(READERS, available_cores())) as pool:
-        descriptor = data.fileno()
+def _digest_of(file: BinaryIO) -> str:
+    """The sha256 of the sha256 of the pieces behind the record, which several threads hash."""
+    descriptor = file.fileno()
 
-        def hash_piece(start: int) -> bytes:
-            return hashlib.sha256(os.pread(descriptor, PIECE_BYTES, start)).digest()
+    def hash_piece(start: int) -> bytes:
+        return hashlib.sha256(os.pread(descriptor, PIECE_BYTES, start)).digest()
 
-        pieces = pool.map(hash_piece, range(0, os.fstat(descriptor).st_size, PIECE_BYTES))
+    with ThreadPoolExecutor(min(READERS, available_cores())) as pool:
+        pieces = pool.map(hash_piece, range(RECORD_BYTES, os.fstat(descriptor).st_size, PIECE_BYTES))
         return hashlib.sha256(b"".join(pieces)).hexdigest()
 
 
 def list_cache() -> tuple[CacheEntry, ...]:
     """The entries of the cache, least recently used first."""
     found = []
-    for entry in sorted((cache_folder() / "rows").glob("*/")):
-        with contextlib.suppress(FileNotFoundError):  # removed meanwhile
-            found.append(_look_at(entry))
-    return tuple(sorted(found, key=lambda entry: entry.used))
+    for file in (cache_folder() / "rows").glob("*.bin"):
+        with contextlib.suppress(FileNotFoundError), file.open("rb") as opened:  # removed meanwhile
+            found.append(_look_at(file, opened))
+    return tuple(sorted(found, key=lambda entry: (entry.used, entry.key)))
 
 
-def _look_at(entry: Path) -> CacheEntry:
-    record, used, in_use = _read_record(entry), entry.stat().st_mtime, False
-    if (entry / RECORD).is_file():
-        with (entry / RECORD).open("rb") as file:
-            used, in_use = os.fstat(file.fileno()).st_mtime, is_locked(file)
+def _look_at(file: Path, opened: BinaryIO) -> CacheEntry:
+    record, status = _read_record(opened), os.fstat(opened.fileno())
     about = (record.environment, record.dataset, record.tasks, record.parts) if record else ("", "", 0, 0)
-    return CacheEntry(entry.name, *about, sum(path.stat().st_size for path in entry.iterdir()), used, in_use)
+    return CacheEntry(file.stem, *about, status.st_size, status.st_mtime, is_locked(opened))
 
 
 def clear_cache() -> tuple[CacheEntry, ...]:
@@ -357,7 +321,7 @@ def clear_cache() -> tuple[CacheEntry, ...]:
         CacheError: the cache's folder cannot be written.
     """
     with _named_cache(cache_folder()):
-        return tuple(entry for entry in list_cache() if _remove(cache_folder() / "rows" / entry.key))
+        return tuple(entry for entry in list_cache() if _remove(_file_of(entry.key)))
 
 
 def verify_cache() -> tuple[tuple[CacheEntry, str], ...]:
@@ -372,23 +336,25 @@ def verify_cache() -> tuple[tuple[CacheEntry, str], ...]:
     damaged = []
     with _named_cache(cache_folder()):
         for entry in list_cache():
-            folder = cache_folder() / "rows" / entry.key
-            problem = _problem(folder)
-            if problem and folder.is_dir():  # else it was removed meanwhile
-                damaged.append((entry, problem))
-                _remove(folder)
+            file = _file_of(entry.key)
+            with contextlib.suppress(FileNotFoundError):  # removed meanwhile
+                with file.open("rb") as opened:
+                    problem = _problem(opened)
+                if problem:
+                    damaged.append((entry, problem))
+                    _remove(file)
     return tuple(damaged)
 
 
 def _make_room(folder: Path, needed: int) -> None:
     """Removes the least recently used entries until a new entry fits; removes none if it cannot fit."""
     limit, entries = cache_limit(), list_cache()
+    kept = sum(entry.bytes for entry in entries if entry.in_use)
     taken = sum(entry.bytes for entry in entries)
-    idle = [entry for entry in entries if not entry.in_use]
-    kept = taken - sum(entry.bytes for entry in idle)
-    while idle and kept + needed <= limit < taken + needed:
-        entry = idle.pop(0)
-        if _remove(folder / "rows" / entry.key):
+    for entry in entries:
+        if entry.in_use or not kept + needed <= limit < taken + needed:
+            continue
+        if _remove(_file_of(entry.key)):
             taken -= entry.bytes
         else:
             kept += entry.bytes
@@ -400,15 +366,12 @@ def _make_room(folder: Path, needed: int) -> None:
 
 
 def _remove(entry: Path) -> bool:
-    """Removes an entry unless a process reads it; its record goes first, so that none opens the rest."""
-    with contextlib.ExitStack() as lock:
-        if (entry / RECORD).is_file():
-            file = lock.enter_context((entry / RECORD).open("r+b"))
-            if not try_exclusive_lock(file) or not is_current(file, entry / RECORD):
-                return False
-            (entry / RECORD).unlink()
-        remove_tree(entry)
-    return not entry.exists()
+    """Removes an entry unless a process reads it."""
+    with contextlib.suppress(FileNotFoundError), entry.open("r+b") as file:
+        if not try_exclusive_lock(file) or not is_current(file, entry):
+            return False
+        entry.unlink()
+    return True
 
 
 @contextlib.contextmanager

@@ -13,8 +13,7 @@ from torch import Tensor
 
 from tcmrl_data.envs.base import Reward
 from tcmrl_data.foundation.errors import RequestError
-from tcmrl_data.sampling.draws import Draw
-from tcmrl_data.sampling.request import BatchRequest, Kind, Trajectories, Transitions
+from tcmrl_data.sampling.draws import BatchRequest, Draw, Kind, Trajectories, Transitions
 from tcmrl_data.sampling.rows import CHUNK_ROWS, Episodes, Indices, PackedRows, Table, Values
 
 SPARE_BUFFERS = 8

@@ -221,8 +221,10 @@ def _check_digests(part: PartRows, arrays: Arrays) -> None:
 def fill_rows(out: Table, arrays: Arrays) -> Indices:
     """Writes a part's arrays into its rows (observations, width) of zeros; returns the episodes' lengths.
 
+    The arrays have the shapes of the part's record, which fit each other.
+
     Raises:
-        StoreError: the arrays do not form episodes, or do not have the shape of `out`.
+        StoreError: the offsets are none of episodes, or the arrays do not have the shape of `out`.
     """
     observations, actions = arrays["observations"], arrays["actions"]
     dense = [name for name in arrays if name == DENSE_REWARDS]
@@ -232,22 +234,14 @@ def fill_rows(out: Table, arrays: Arrays) -> Indices:
             f"observations and actions are {observations.shape[1]} and {actions.shape[1]} wide, the "
             f"environment's take {columns} columns"
         )
-    offsets = checked_offsets(arrays["episode_offsets"], len(actions))
-    lengths = np.diff(offsets)
-    if len(observations) != len(actions) + len(lengths) or len(observations) != len(out):
-        raise StoreError(
-            f"{len(observations)} observations do not fit {len(actions)} actions in {len(lengths)} episodes"
-        )
-    scalars = ("rewards", "terminated", *dense)
-    for name in scalars:
-        if len(arrays[name]) != len(actions):
-            raise StoreError(f"{name} has {len(arrays[name])} steps, actions have {len(actions)}")
-    observation_dim = observations.shape[1]
+    if len(observations) != len(out):
+        raise StoreError(f"{len(observations)} observations, the table of parts calls for {len(out)}")
+    lengths: Indices = np.diff(checked_offsets(arrays["episode_offsets"], len(actions)))
     # an episode has one row more than steps
     steps = np.arange(len(actions)) + np.repeat(np.arange(len(lengths)), lengths)
-    out[:, :observation_dim] = observations
-    out[steps, observation_dim:columns] = actions
-    for column, name in enumerate(scalars, start=columns):
+    out[:, : observations.shape[1]] = observations
+    out[steps, observations.shape[1] : columns] = actions
+    for column, name in enumerate(("rewards", "terminated", *dense), start=columns):
         out[steps, column] = arrays[name]
     return lengths
 

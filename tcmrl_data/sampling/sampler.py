@@ -16,12 +16,20 @@ import torch
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Reward
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.foundation.machine import available_memory, size
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_sequence
-from tcmrl_data.sampling.cache import load_rows
-from tcmrl_data.sampling.draws import Draws
+from tcmrl_data.sampling.cache import cached_rows
+from tcmrl_data.sampling.draws import BatchRequest, Draws, Trajectories
 from tcmrl_data.sampling.gather import Batch, Endings, Gatherer, place_table
-from tcmrl_data.sampling.request import BatchRequest, Trajectories
-from tcmrl_data.sampling.rows import Indices, Moments, PackedRows, moments_of
+from tcmrl_data.sampling.rows import (
+    Indices,
+    Moments,
+    PackedRows,
+    moments_of,
+    plan_rows,
+    read_rows,
+    table_shape,
+)
 
 Item = TypeVar("Item")
 
@@ -81,6 +89,31 @@ def open_sampler(
         place=str(selection.dataset.folder),
         device=device,
     )
+
+
+def load_rows(
+    selection: Selection,
+    *,
+    dense: bool = False,
+    memory_limit: int | None = None,
+    say: Callable[[str], None] | None = None,
+) -> PackedRows:
+    """The rows of a selection in memory, or mapped from the cache if they exceed the limit.
+
+    Arguments as of `open_sampler`; `dense` loads dense rewards too.
+
+    Raises:
+        TcmrlError: as `read_rows` or `cached_rows` does.
+    """
+    rows, width = table_shape(selection, plan_rows(selection, dense=dense))
+    needed = 4 * rows * width
+    limit = available_memory() // 2 if memory_limit is None else memory_limit
+    if needed <= limit:
+        return read_rows(selection, dense=dense)
+    if say:
+        why = "half of the available memory" if memory_limit is None else "the memory limit"
+        say(f"{size(needed)} of steps exceed {why}, {size(limit)}: using the cache")
+    return cached_rows(selection, dense=dense, say=say)
 
 
 class Sampler:
