@@ -13,6 +13,9 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
+import numpy.typing as npt
+
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.tasks import Split, Task
@@ -33,6 +36,7 @@ from tcmrl_data.foundation.disk import (
 from tcmrl_data.foundation.errors import MissingPackageError, StorageError, StoreError
 from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.interchange.reader import EPISODE_ARRAYS, FORMAT_VERSION
 from tcmrl_data.recipe.about import AND
 from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.tables import task_line
@@ -60,14 +64,18 @@ class Format(abc.ABC):
     """
 
     name: ClassVar[str]
+    suffix: ClassVar[str] = ""
+    """Of the file of a task."""
+    takes_empty_episodes: ClassVar[bool] = False
+    """Whether a file can hold an episode without steps."""
     optional_packages: ClassVar[tuple[str, ...]] = ()
     """Modules that the methods import and that an installation without extras lacks."""
     extra: ClassVar[str | None] = None
     """The extra that brings them, such as `tcmrl[minari]`."""
 
-    @abc.abstractmethod
     def place(self, selection: Selection, task: Task) -> str:
-        """Path of a task's file or folder within the export, such as `task_00000.hdf5`."""
+        """Path of a task's file or folder within the export."""
+        return f"task_{task.index:05d}{self.suffix}"
 
     @abc.abstractmethod
     def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
@@ -75,7 +83,7 @@ class Format(abc.ABC):
 
         Args:
             selection: `selection.parts[task.index]` are the parts to write, in that order, one in memory at
-                a time.
+                a time, as `parts` gives them.
             task: one of the selection's.
             path: a new path that ends in `place(selection, task)`; its parent exists.
 
@@ -88,23 +96,90 @@ class Format(abc.ABC):
         """Small files beside those of the tasks: path within the export, and content."""
         return {}
 
+    def attributes(self, selection: Selection, task: Task) -> dict[str, Any]:
+        """Numbers and texts that name the task of a file and the dataset that it came from.
+
+        A dataset without a seed, such as an imported one, has no attribute `seed`.
+        """
+        manifest = selection.dataset.manifest
+        attributes = {
+            "format": f"tcmrl-{self.name}",
+            "format_version": FORMAT_VERSION,
+            "environment": manifest.name,
+            "task": task.index,
+            "split": task.split,
+            "parameters": json.dumps(dict(task.parameters), sort_keys=True),
+            "dataset_root": manifest.root,
+            "recipe": json.dumps(manifest.recipe.unit_settings(), sort_keys=True),
+            "citation": manifest.recipe.about.citation,
+            "licence": AND.join(manifest.licences),
+        }
+        return attributes if manifest.seed is None else attributes | {"seed": manifest.seed}
+
+    def parts(
+        self, selection: Selection, task: Task, file: Path
+    ) -> Iterator[tuple[PartKey, Sequence[Trajectory]]]:
+        """The parts of a task with their episodes, each when the file has room for it.
+
+        Args:
+            selection: what is exported.
+            task: one of the selection's.
+            file: that grows; HDF5 leaves a broken process behind where it cannot.
+
+        Raises:
+            StoreError: an episode has no steps, and the format cannot hold one.
+            StorageError: the disk refuses.
+        """
+        for key in selection.parts[task.index]:
+            trajectories = selection.dataset.trajectories(*key)
+            num_bytes = FILE_BYTES + EPISODE_BYTES * len(trajectories)
+            for index, trajectory in enumerate(trajectories):
+                if not len(trajectory) and not self.takes_empty_episodes:
+                    raise StoreError(
+                        f"{selection.dataset.file_of(key)}: episode {index} has no steps, which {self.name} "
+                        "cannot hold; export with --format hdf5"
+                    )
+                num_bytes += COPIES * sum(array.nbytes for array in episode_arrays(trajectory).values())
+            require_room(file, num_bytes, remedy=REMEDY)
+            yield key, trajectories
+
+
+def episode_arrays(trajectory: Trajectory) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an episode by their names."""
+    return {name: getattr(trajectory, name) for name in EPISODE_ARRAYS} | dict(trajectory.extras)
+
+
+def transitions(
+    trajectories: Sequence[Trajectory], *, first: int = 0, step: int = 0
+) -> dict[str, npt.NDArray[Any]]:
+    """The steps of episodes behind one another, (N, …), by the names of `Trajectory`, and further ones.
+
+    `next_observations`; `episode` (N,) int64 numbers the episodes; `step` (N,) int64 is the snapshot's.
+
+    Args:
+        trajectories: at least one; all have the same further arrays.
+        first: number of the first episode.
+        step: of the snapshot.
+    """
+    lengths = [len(trajectory) for trajectory in trajectories]
+    observations = [trajectory.observations for trajectory in trajectories]
+    others = [name for name in episode_arrays(trajectories[0]) if name != "observations"]
+    every = [episode_arrays(trajectory) for trajectory in trajectories]
+    return {
+        "observations": np.concatenate([rows[:-1] for rows in observations]),
+        "next_observations": np.concatenate([rows[1:] for rows in observations]),
+        **{name: np.concatenate([arrays[name] for arrays in every]) for name in others},
+        "episode": np.repeat(np.arange(first, first + len(lengths), dtype=np.int64), lengths),
+        "step": np.full(sum(lengths), step, dtype=np.int64),
+    }
+
 
 FORMATS = Registry("tcmrl.formats", "format", Format)
 
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What an export wrote, or would write.
-
-    Attributes:
-        format: its name.
-        out: the new folder.
-        tasks: number of tasks.
-        parts: number of parts.
-        episodes: number of episodes.
-        steps: number of steps.
-        files: all files, sorted; none where nothing was written.
-    """
+    """What an export wrote to the new folder `out`, or would write; `files` are sorted."""
 
     format: str
     out: Path
@@ -200,67 +275,6 @@ def require_packages(what: str, packages: Sequence[str], extra: str | None) -> N
         ) from None
 
 
-def task_attributes(selection: Selection, task: Task, *, layout: str, version: int) -> dict[str, Any]:
-    """Numbers and texts that name the task of a file and the dataset that it came from.
-
-    A dataset without a seed, such as an imported one, has no attribute `seed`.
-
-    Args:
-        selection: what is exported.
-        task: of the file.
-        layout: of the file, such as `tcmrl-hdf5`.
-        version: of the layout.
-    """
-    manifest = selection.dataset.manifest
-    attributes = {
-        "format": layout,
-        "format_version": version,
-        "environment": manifest.name,
-        "task": task.index,
-        "split": task.split,
-        "parameters": json.dumps(dict(task.parameters), sort_keys=True),
-        "dataset_root": manifest.root,
-        "recipe": json.dumps(manifest.recipe.unit_settings(), sort_keys=True),
-        "citation": manifest.recipe.about.citation,
-        "licence": AND.join(manifest.licences),
-    }
-    return attributes if manifest.seed is None else attributes | {"seed": manifest.seed}
-
-
-def stored_episodes(dataset: Dataset, key: PartKey, *, format_name: str) -> Sequence[Trajectory]:
-    """The episodes of a part, for a format that cannot hold one without steps.
-
-    Raises:
-        StoreError: an episode has no steps.
-    """
-    trajectories = dataset.trajectories(*key)
-    for index, trajectory in enumerate(trajectories):
-        if not len(trajectory):
-            raise StoreError(
-                f"{dataset.file_of(key)}: episode {index} has no steps, which {format_name} cannot hold; "
-                "export with --format hdf5"
-            )
-    return trajectories
-
-
-def require_room_for(file: Path, trajectories: Sequence[Trajectory] = ()) -> None:
-    """Checks that a file can take episodes; HDF5 leaves a broken process behind where it cannot.
-
-    Args:
-        file: written next, or about to be made.
-        trajectories: what it takes; none where only the file itself is to be made.
-
-    Raises:
-        StorageError: the disk refuses.
-    """
-    num_bytes = FILE_BYTES + EPISODE_BYTES * len(trajectories)
-    for trajectory in trajectories:
-        arrays = (trajectory.observations, trajectory.actions, trajectory.rewards, trajectory.terminated)
-        all_arrays = (*arrays, trajectory.truncated, *trajectory.extras.values())
-        num_bytes += COPIES * sum(array.nbytes for array in all_arrays)
-    require_room(file, num_bytes, remedy=REMEDY)
-
-
 def staging_folder(out: Path) -> Path:
     """Where the export to `out` is made, and kept when it is interrupted."""
     return out.with_name(f".{out.name}.partial")
@@ -285,6 +299,7 @@ def _write(
                     progress(done, total)
                 continue
             with _adding(staged, name) as path:
+                require_room(path, FILE_BYTES, remedy=REMEDY)
                 for _ in exporter.write(selection, task, path):
                     done += 1
                     if progress is not None:

@@ -11,9 +11,9 @@ take the last row of each for the end of an episode, so that flags, extra arrays
 end with the time limit, so every last step is read as truncated, and the import says so.
 
 An object array is a pickle, which could run anything. It is read by the standard library's unpickler with an
-allow-list of the names that NumPy's arrays need. The names stand for classes of this module and not for
-NumPy's own functions: those take a forged type's word for what is a pointer, and crash or worse. The
-unpickler is the one in Python, since the one in C reserves as much memory as a pickle asks for.
+allow-list of the names that NumPy's arrays need. The names stand for functions of this module and not for
+NumPy's own: those take a forged type's word for what is a pointer, and crash or worse. The unpickler is the
+one in Python, since the one in C reserves as much memory as a pickle asks for.
 """
 
 import os
@@ -35,13 +35,16 @@ from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.disk import disk, named_errors
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
-from tcmrl_data.interchange.exporting import REMEDY, Format, stored_episodes
+from tcmrl_data.interchange.exporting import REMEDY, Format
 from tcmrl_data.interchange.reader import (
+    DAMAGE,
     EpisodeCuts,
+    FileTask,
     Reader,
     ReaderOptions,
     ReadPart,
     Say,
+    damage_at,
     decoded_limit,
     episodes_of_rows,
     require_file,
@@ -90,8 +93,8 @@ class IdaqNpyFormat(Format):
         with named_errors(path, remedy=REMEDY):
             disk.make_folder(path)
         written: Counter[int] = Counter()
-        for key in selection.parts[task.index]:
-            for trajectory in stored_episodes(selection.dataset, key, format_name=self.name):
+        for key, trajectories in self.parts(selection, task, path):
+            for trajectory in trajectories:
                 file = path / f"trj_evalsample{written[key.step]}_step{key.step}.npy"
                 with named_errors(file, remedy=REMEDY):
                     disk.write(file, _pickled(trajectory))
@@ -154,18 +157,20 @@ class IdaqNpyReader(Reader):
             parts[file.task, file.step].append(file)
         cuts = EpisodeCuts()
         for (task, step), files in parts.items():
-            yield ReadPart(task, step, [episode for file in files for episode in _read(file.path, cuts)])
+            yield ReadPart(
+                FileTask(task), step, [episode for file in files for episode in _read(file.path, cuts)]
+            )
         cuts.tell(say, path)
 
     def _chosen(self, path: Path, say: Say | None) -> list[_File]:
         """The files to read, sorted by task, step and episode."""
         found = sorted(_list(path))
         sampled = {file.task for file in found if file.policy == "sample"}
+        wanted = self.options.episodes
         chosen = [
             file
             for file in found
-            if file.policy
-            == (self.options.episodes or ("sample" if file.task in sampled else "deterministic"))
+            if file.policy == (wanted or ("sample" if file.task in sampled else "deterministic"))
         ]
         if not chosen:
             raise StoreError(
@@ -182,47 +187,37 @@ def _list(path: Path) -> Iterator[_File]:
     Raises:
         StoreError: a folder cannot be listed, or an episode's file is no regular file.
     """
-    for name in _names(path):
-        match = _TASK.fullmatch(name)
-        for episode in _names(path / name) if match is not None else ():
-            found = _EPISODE.fullmatch(episode)
-            if match is not None and found is not None:
-                file = path / name / episode
-                require_file(file)
-                policy: Policy = "sample" if found[1] else "deterministic"
-                yield _File(int(match[1]), int(found[3]), int(found[2]), policy, file)
+    for task in filter(None, map(_TASK.fullmatch, _names(path))):
+        for episode in filter(None, map(_EPISODE.fullmatch, _names(path / task[0]))):
+            file = path / task[0] / episode[0]
+            require_file(file)
+            policy: Policy = "sample" if episode[1] else "deterministic"
+            yield _File(int(task[1]), int(episode[3]), int(episode[2]), policy, file)
 
 
 def _names(folder: Path) -> list[str]:
-    try:
+    with damage_at(f"{printable(str(folder))} cannot be read:"):
         return os.listdir(folder)
-    except OSError as error:
-        raise StoreError(f"{printable(str(folder))} cannot be read ({one_line(error)})") from None
 
 
 def _read(path: Path, cuts: EpisodeCuts) -> list[Trajectory]:
     """The episode of a file; several where its rows do not follow each other."""
-    try:
+    with damage_at(str(path)):
         data = read_plain_file(path, limit=LARGEST_FILE)
-        rows = _rows(data)
+        cells = _cells(data)
         observations, actions, rewards, following = (
-            _column(rows[column::COLUMNS], column, len(data)) for column in range(COLUMNS)
+            _column(cells[column::COLUMNS], column, len(data)) for column in range(COLUMNS)
         )
-    except (OSError, ValueError) as error:
-        raise StoreError(f"{path} {one_line(error)}") from None
-    return episodes_of_rows(
-        observations=observations,
-        actions=actions,
-        rewards=rewards,
-        terminals=np.zeros(len(rewards), dtype=bool),
-        timeouts=None,
-        next_observations=following,
-        cuts=cuts,
-        place=str(path),
-    )
+    rows = {
+        "observations": observations,
+        "actions": actions,
+        "rewards": rewards,
+        "next_observations": following,
+    }
+    return episodes_of_rows(rows, cuts=cuts, place=str(path))
 
 
-def _rows(data: bytes) -> list[Any]:
+def _cells(data: bytes) -> list[Any]:
     """The cells of all rows of a file, one row's behind another's.
 
     Raises:
@@ -261,7 +256,7 @@ class PickleRefusedError(ValueError):
 
 
 class _StandIn:
-    """What a name in a pickle stands for: it can be called and given a state, but no attribute is set."""
+    """What a pickle's name stands for, or its result: a pickle can give it a state, but set no attribute."""
 
     __slots__ = ()
 
@@ -270,25 +265,16 @@ class _StandIn:
 
 
 @final
-class _ArrayClass(_StandIn):
-    """`numpy.ndarray`, which arrays name and never call."""
+class _Name(_StandIn):
+    """A name of the allow-list, and what it does when it is called."""
 
-    __slots__ = ()
+    __slots__ = ("call",)
 
-    def __new__(cls, *arguments: Any) -> "_ArrayClass":
-        raise PickleRefusedError("makes something else than an array")
+    def __init__(self, call: Callable[..., Any]) -> None:
+        self.call = call
 
-
-@final
-class _Bytes(_StandIn):
-    """`_codecs.encode`, by which protocol 2 writes bytes."""
-
-    __slots__ = ()
-
-    def __new__(cls, text: Any, encoding: Any) -> Any:
-        if not isinstance(text, str) or encoding != "latin1":
-            raise PickleRefusedError("encodes something else than bytes")
-        return text.encode("latin1")
+    def __call__(self, *arguments: Any) -> Any:
+        return self.call(*arguments)
 
 
 @final
@@ -297,15 +283,10 @@ class _Type(_StandIn):
 
     __slots__ = ("code", "order")
 
-    code: str
-    order: str
-
-    def __new__(cls, code: Any, *flags: Any) -> "_Type":
+    def __init__(self, code: Any, *flags: Any) -> None:
         if code not in (OBJECT_TYPE, *NUMBER_TYPES):
             raise PickleRefusedError(f"holds values of type {repr(code)[:40]}")
-        made = super().__new__(cls)
-        made.code, made.order = code, "<"
-        return made
+        self.code, self.order = code, "<"
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, tuple) or len(state) < 5 or state[1] not in ("<", ">", "|", "="):
@@ -323,20 +304,8 @@ class _Type(_StandIn):
 
 
 @final
-class _Scalar(_StandIn):
-    """`numpy.core.multiarray.scalar`, which makes a number."""
-
-    __slots__ = ()
-
-    def __new__(cls, kind: Any, data: Any) -> Any:
-        if not isinstance(kind, _Type) or kind.code == OBJECT_TYPE:
-            raise PickleRefusedError("holds a number without its type")
-        return float(kind.values(data, 1)[0])
-
-
-@final
 class PickledArray(_StandIn):
-    """`numpy.core.multiarray._reconstruct`: an array as a pickle has it.
+    """An array as a pickle has it: `numpy.core.multiarray._reconstruct` makes it, its state fills it.
 
     Attributes:
         shape: of the array.
@@ -345,16 +314,12 @@ class PickledArray(_StandIn):
 
     __slots__ = ("_values", "cells", "shape")
 
-    shape: tuple[int, ...]
-    cells: list[Any] | None
-    _values: npt.NDArray[Any] | None
-
-    def __new__(cls, kind: Any, shape: Any, code: Any) -> "PickledArray":
-        if kind is not _ArrayClass or shape != (0,):
+    def __init__(self, kind: Any, shape: Any, code: Any) -> None:
+        if kind is not _ARRAY or shape != (0,):
             raise PickleRefusedError("makes something else than an array")
-        made = super().__new__(cls)
-        made.shape, made.cells, made._values = (), None, None
-        return made
+        self.shape: tuple[int, ...] = ()
+        self.cells: list[Any] | None = None
+        self._values: npt.NDArray[Any] | None = None
 
     def __setstate__(self, state: Any) -> None:
         if not isinstance(state, tuple) or len(state) != 5:
@@ -385,12 +350,33 @@ class PickledArray(_StandIn):
         return self._values
 
 
-_ALLOWED: dict[tuple[str, str], type[_StandIn]] = {
-    ("numpy", "ndarray"): _ArrayClass,
-    ("numpy", "dtype"): _Type,
-    ("_codecs", "encode"): _Bytes,
-    **{(f"numpy.{core}.multiarray", "_reconstruct"): PickledArray for core in ("core", "_core")},
-    **{(f"numpy.{core}.multiarray", "scalar"): _Scalar for core in ("core", "_core")},
+def _refused(*arguments: Any) -> Any:
+    raise PickleRefusedError("makes something else than an array")
+
+
+def _bytes(text: Any, encoding: Any) -> bytes:
+    """`_codecs.encode`, by which protocol 2 writes bytes."""
+    if not isinstance(text, str) or encoding != "latin1":
+        raise PickleRefusedError("encodes something else than bytes")
+    return text.encode("latin1")
+
+
+def _scalar(kind: Any, data: Any) -> float:
+    """`numpy.core.multiarray.scalar`, which makes a number."""
+    if not isinstance(kind, _Type) or kind.code == OBJECT_TYPE:
+        raise PickleRefusedError("holds a number without its type")
+    return float(kind.values(data, 1)[0])
+
+
+_ARRAY = _Name(_refused)
+"""`numpy.ndarray`, which arrays name and never call."""
+
+_ALLOWED: dict[tuple[str, str], _Name] = {
+    ("numpy", "ndarray"): _ARRAY,
+    ("numpy", "dtype"): _Name(_Type),
+    ("_codecs", "encode"): _Name(_bytes),
+    **{(f"numpy.{core}.multiarray", "_reconstruct"): _Name(PickledArray) for core in ("core", "_core")},
+    **{(f"numpy.{core}.multiarray", "scalar"): _Name(_scalar) for core in ("core", "_core")},
 }
 
 
@@ -417,9 +403,6 @@ class _Unpickler(pickle._Unpickler):
             raise PickleRefusedError(f"names {place}, which arrays do not need; it would run code")
         return found
 
-    def persistent_load(self, pid: Any) -> Any:
-        raise PickleRefusedError("refers to objects outside")
-
 
 def unpickle_array(data: bytes) -> PickledArray:
     """The array of a pickle.
@@ -431,10 +414,7 @@ def unpickle_array(data: bytes) -> PickledArray:
         found = _Unpickler(BytesIO(data)).load()
     except PickleRefusedError:
         raise
-    except (
-        *(EOFError, pickle.UnpicklingError, ValueError, TypeError, LookupError, AttributeError),
-        *(OverflowError, MemoryError, RecursionError),
-    ) as error:
+    except (*DAMAGE, RecursionError) as error:
         raise PickleRefusedError(f"is no whole pickle ({one_line(error) or type(error).__name__})") from None
     if not isinstance(found, PickledArray):
         raise PickleRefusedError(f"holds {type(found).__name__.strip('_')}, not an array")

@@ -12,13 +12,14 @@ from typing import Any
 import numpy as np
 
 from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, digest
 from tcmrl_data.foundation.errors import StoreError, TaskError
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
 from tcmrl_data.foundation.records import hidden_text, validate_table
 from tcmrl_data.interchange.exporting import require_packages
-from tcmrl_data.interchange.reader import READERS, Reader, ReadPart, Say
-from tcmrl_data.operations.assembly import Assembly, derivation_of, open_assembly
+from tcmrl_data.interchange.reader import READERS, Reader, ReadPart, Say, damage_at
+from tcmrl_data.operations.assembly import derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.recipe import Recipe, bound_recipe, check_licence, foreign_recipe
@@ -30,17 +31,10 @@ from tcmrl_data.store.tables import parse_task_file, task_line
 
 @dataclass(frozen=True)
 class ImportReport:
-    """What an import made, or would make.
+    """What an import made in the folder `out`, or would make.
 
     Attributes:
-        out: the dataset's folder.
-        environment: the environment's name, `foreign` for one that is not ours.
-        tasks: number of tasks.
-        parts: number of parts.
-        episodes: number of episodes.
-        steps: number of steps.
-        observation_dim: width of observations.
-        action_dim: width of actions.
+        environment: its name, `foreign` for one that is not ours.
         horizon: steps of the longest episode.
         notes: what was cut or left out of the files, in words.
         root: of the dataset; None where nothing was written.
@@ -126,22 +120,23 @@ def import_dataset(
     digests = source.digests()
     notes: list[str] = []
     survey = _Survey()
-    for path, part in source.parts(notes.append):
+    for path, index, part in source.parts(notes.append):
         try:
-            survey.add(part)
+            survey.add(index, part)
         except StoreError as error:
             raise StoreError(f"{path}: {error}") from None
-    known = {} if tasks is None else _tasks_of_file(Path(tasks))
-    plan = _plan(survey, known, environment=environment, licence=licence)
+    known = survey.tasks if tasks is None else survey.tasks | _tasks_of_file(Path(tasks))
+    imported = {index: known[index] for index in sorted(survey.tasks)}
+    recipe, extras = _recipe_of(survey, [*imported.values()], environment=environment, licence=licence)
     report = ImportReport(
         out=Path(out),
-        environment=plan.recipe.environment.name,
-        tasks=len(plan.tasks),
+        environment=recipe.environment.name,
+        tasks=len(imported),
         parts=len(survey.keys),
         episodes=survey.episodes,
         steps=survey.steps,
-        observation_dim=survey.observation_dim,
-        action_dim=survey.action_dim,
+        observation_dim=survey.sizes[0],
+        action_dim=survey.sizes[1],
         horizon=survey.horizon,
         notes=tuple(notes),
         root=None,
@@ -152,17 +147,25 @@ def import_dataset(
     settings = {
         "options": reader.options.model_dump(mode="json"),
         "origin": digest(origin),
-        "tasks": digest([task_line(task).decode() for task in plan.tasks]),
-        "recipe": digest(plan.recipe.unit_settings()),
+        "tasks": digest([task_line(task).decode() for task in imported.values()]),
+        "recipe": digest(recipe.unit_settings()),
     }
-    run = Run(name=MAIN_RUN, kind="imported", seed=None, recipe=plan.recipe, origin=origin, steps=None)
+    run = Run(name=MAIN_RUN, kind="imported", seed=None, recipe=recipe, origin=origin, steps=None)
     with open_assembly(Path(out), derivation_of("import", settings, []), []) as assembly:
-        _publish(assembly, source, plan, progress, total=report.parts)
+        for done, (_, index, part) in enumerate(source.parts(), start=1):
+            make = functools.partial(_make_part, recipe, extras, imported[index], part)
+            assembly.write(PartKey(index, part.step), make)
+            if progress is not None:
+                progress(done, report.parts)
         for before, now in zip(digests, source.digests(), strict=True):
             if before != now:
                 raise StoreError(f"{now[0]} changed meanwhile; remove {out} and import again")
         manifest = assembly.finish(
-            name=report.environment, data_version=DATA_VERSION, runs=[run], tasks=plan.tasks, label=label
+            name=report.environment,
+            data_version=DATA_VERSION,
+            runs=[run],
+            tasks=[*imported.values()],
+            label=label,
         )
     return dataclasses.replace(report, root=manifest.root)
 
@@ -172,10 +175,9 @@ class _Survey:
     """Sums and sizes of the parts that were added.
 
     Attributes:
-        keys: of the parts.
         tasks: as the files describe them, by index.
         horizon: steps of the longest episode.
-        extras: dtypes of the per-step arrays that all episodes have, by name.
+        extras: dtypes of the per-step arrays that all episodes have, by name; None before the first one.
     """
 
     keys: set[PartKey] = field(default_factory=set)
@@ -183,27 +185,16 @@ class _Survey:
     episodes: int = 0
     steps: int = 0
     horizon: int = 0
-    observation_dim: int = 0
-    action_dim: int = 0
-    _extras: dict[str, str] | None = None
+    sizes: tuple[int, int] = (0, 0)
+    extras: dict[str, str] | None = None
 
-    @property
-    def extras(self) -> dict[str, str]:
-        """Dtypes of the per-step arrays that all episodes have, by name."""
-        return dict(sorted((self._extras or {}).items()))
-
-    def steps_of_tasks(self) -> list[int]:
-        """Number of snapshot steps of every task."""
-        return list(Counter(key.task for key in self.keys).values())
-
-    def add(self, part: ReadPart) -> None:
-        """Adds a part.
+    def add(self, index: int, part: ReadPart) -> None:
+        """Adds a part of the task with this index.
 
         Raises:
             StoreError: it stands in the files twice, or does not fit the parts before it.
         """
-        assert part.task is not None
-        key = PartKey(part.task, part.step)
+        key = PartKey(index, part.step)
         if not 0 <= min(key.task, key.step) <= max(key.task, key.step) < MAX_INDEX:
             raise StoreError(f"{key}: task and step must be from 0 to {MAX_INDEX - 1}")
         if key in self.keys:
@@ -211,57 +202,40 @@ class _Survey:
                 f"{key} is in the files twice; give every file its task, or import them apart and merge"
             )
         self.keys.add(key)
-        self._add_task(part)
-        for trajectory in part.trajectories:
-            sizes = (trajectory.observations.shape[1], trajectory.actions.shape[1])
-            if min(sizes) < 1:
-                raise StoreError(f"{key}: observations and actions have {sizes} columns, 1 is the least")
-            if self.episodes and sizes != (self.observation_dim, self.action_dim):
-                raise StoreError(
-                    f"{key}: observations and actions have {sizes} columns, those of the parts before "
-                    f"{(self.observation_dim, self.action_dim)}"
-                )
-            self.observation_dim, self.action_dim = sizes
-            self.episodes += 1
-            self.steps += len(trajectory)
-            self.horizon = max(self.horizon, len(trajectory))
-            found = self.named_types({name: array.dtype for name, array in trajectory.extras.items()})
-            before = found if self._extras is None else self._extras
-            self._extras = dict(found.items() & before.items())
-            if len(self._extras) > MAX_ARRAYS - len(STANDARD_ARRAYS):
-                raise StoreError(
-                    f"{key}: has {len(found)} further arrays, a part has at most {MAX_ARRAYS} in all"
-                )
-
-    @staticmethod
-    def named_types(types: Mapping[str, Any]) -> dict[str, str]:
-        """The names of dtypes."""
-        return {name: str(np.dtype(dtype)) for name, dtype in types.items()}
-
-    def _add_task(self, part: ReadPart) -> None:
-        assert part.task is not None
-        hidden = hidden_text(dict(part.about.parameters))
+        task = Task(index, part.task.split or "train", dict(part.task.parameters))
+        hidden = hidden_text(task.parameters)
         if hidden is not None:
-            place = printable(hidden)[:200]
-            raise StoreError(f"task {part.task}: parameters {place} hold control characters")
-        task = Task(part.task, part.about.split or "train", dict(part.about.parameters))
-        known = self.tasks.setdefault(part.task, task)
-        if known != task:
-            raise StoreError(f"task {part.task}: two files give it different parameters or splits")
+            raise StoreError(f"task {index}: parameters {printable(hidden)[:200]} hold control characters")
+        if self.tasks.setdefault(index, task) != task:
+            raise StoreError(f"task {index}: two files give it different parameters or splits")
+        for trajectory in part.trajectories:
+            self._add_episode(trajectory, key)
 
-
-@dataclass(frozen=True)
-class _Plan:
-    """What the parts of an import have in common."""
-
-    recipe: Recipe
-    tasks: tuple[Task, ...]
-    extras: frozenset[str]
+    def _add_episode(self, trajectory: Trajectory, key: PartKey) -> None:
+        sizes = (trajectory.observations.shape[1], trajectory.actions.shape[1])
+        if min(sizes) < 1:
+            raise StoreError(f"{key}: observations and actions have {sizes} columns, 1 is the least")
+        if self.episodes and sizes != self.sizes:
+            raise StoreError(
+                f"{key}: observations and actions have {sizes} columns, those of the parts before "
+                f"{self.sizes}"
+            )
+        self.sizes = sizes
+        self.episodes += 1
+        self.steps += len(trajectory)
+        self.horizon = max(self.horizon, len(trajectory))
+        found = {name: str(array.dtype) for name, array in trajectory.extras.items()}
+        kept = found.items() if self.extras is None else found.items() & self.extras.items()
+        self.extras = dict(sorted(kept))
+        if len(self.extras) > MAX_ARRAYS - len(STANDARD_ARRAYS):
+            raise StoreError(
+                f"{key}: has {len(found)} further arrays, a part has at most {MAX_ARRAYS} in all"
+            )
 
 
 @dataclass(frozen=True)
 class _Source:
-    """The paths of an import as one stream of parts that name their tasks."""
+    """The paths of an import as one stream of parts."""
 
     reader: Reader
     paths: Sequence[Path]
@@ -273,38 +247,36 @@ class _Source:
             raise StoreError("no file is named; name at least one")
         return [_path_digest(path, self.reader.files(path)) for path in self.paths]
 
-    def parts(self, say: Say | None = None) -> Iterator[tuple[Path, ReadPart]]:
-        """The parts of all paths, with their paths."""
+    def parts(self, say: Say | None = None) -> Iterator[tuple[Path, int, ReadPart]]:
+        """The parts of all paths, with their paths and the indices of their tasks."""
         for position, path in enumerate(self.paths):
-            own: set[int] = set()
+            own: set[int | None] = set()
             for part in self.reader.read(path, say):
-                index = part.task
+                index = part.task.index
                 if self.first_task is not None or index is None:
-                    own.add(-1 if index is None else index)
+                    own.add(index)
                     index = (self.first_task or 0) + position
                 if len(own) > 1:
                     raise StoreError(
                         f"{path} holds several tasks, which have their numbers; leave --task out"
                     )
-                yield path, dataclasses.replace(part, task=index)
+                yield path, index, part
 
 
-def _plan(
-    survey: _Survey, known: Mapping[int, Task], *, environment: str | None, licence: str | None
-) -> _Plan:
-    """The recipe and the tasks of an import.
+def _recipe_of(
+    survey: _Survey, tasks: Sequence[Task], *, environment: str | None, licence: str | None
+) -> tuple[Recipe, list[str]]:
+    """The recipe of an import, and the further arrays that its parts keep.
 
     Raises:
         StoreError: the episodes do not fit the environment.
         BuildError: the dataset would exceed a limit.
     """
-    extras = survey.extras
-    found = {index: known.get(index, task) for index, task in survey.tasks.items()}
-    tasks = tuple(found[index] for index in sorted(found))
+    extras = survey.extras or {}
     check_plan(
         tasks=len(tasks),
-        steps=max(survey.steps_of_tasks()),
-        columns=max(survey.observation_dim, survey.action_dim),
+        steps=max(Counter(key.task for key in survey.keys).values()),
+        columns=max(survey.sizes),
         largest_task=max(len(task_line(task)) for task in tasks),
     )
     if environment is None:
@@ -312,60 +284,37 @@ def _plan(
             tasks=len(tasks),
             train=sum(task.split == "train" for task in tasks),
             horizon=survey.horizon,
-            observation_dim=survey.observation_dim,
-            action_dim=survey.action_dim,
+            observation_dim=survey.sizes[0],
+            action_dim=survey.sizes[1],
             extra_arrays=extras,
             licence=licence,
         )
-        return _Plan(recipe, tasks, frozenset(extras))
+        return recipe, list(extras)
     recipe = bound_recipe(environment, licence=licence)
     made = recipe.make_environment()
-    for what, value, wanted in (
-        ("columns of observations", survey.observation_dim, made.observation_dim),
-        ("columns of actions", survey.action_dim, made.action_dim),
+    for what, found, wanted in zip(
+        ("observations", "actions"), survey.sizes, (made.observation_dim, made.action_dim), strict=True
     ):
-        if value != wanted:
+        if found != wanted:
             raise StoreError(
-                f"the files have {value} {what}, {environment} has {wanted}; name another environment"
+                f"the files have {found} columns of {what}, {environment} has {wanted}; name another "
+                "environment"
             )
     if survey.horizon > made.settings.horizon:
         raise StoreError(
             f"the files have an episode of {survey.horizon} steps, the horizon of {environment} is "
             f"{made.settings.horizon}; name another --environment or none"
         )
-    wanted_extras = {name: str(dtype) for name, dtype in survey.named_types(made.extras).items()}
-    kept = frozenset(name for name, dtype in extras.items() if wanted_extras.get(name) == dtype)
-    return _Plan(recipe, tasks, kept)
+    types = {name: str(np.dtype(dtype)) for name, dtype in made.extras.items()}
+    return recipe, [name for name, dtype in extras.items() if types.get(name) == dtype]
 
 
-def _publish(
-    assembly: Assembly,
-    source: _Source,
-    plan: _Plan,
-    progress: Callable[[int, int], None] | None,
-    *,
-    total: int,
-) -> None:
-    """Writes the parts that no earlier attempt has written."""
-    tasks = {task.index: task for task in plan.tasks}
-    for done, (_, part) in enumerate(source.parts(), start=1):
-        assert part.task is not None
-        task = tasks[part.task]
-        assembly.write(PartKey(task.index, part.step), functools.partial(_make_part, plan, task, part))
-        if progress is not None:
-            progress(done, total)
-
-
-def _make_part(plan: _Plan, task: Task, part: ReadPart) -> tuple[PartRecord, bytes]:
+def _make_part(recipe: Recipe, extras: Sequence[str], task: Task, part: ReadPart) -> tuple[PartRecord, bytes]:
     trajectories = [
-        dataclasses.replace(
-            trajectory, extras={name: trajectory.extras[name] for name in sorted(plan.extras)}
-        )
+        dataclasses.replace(trajectory, extras={name: trajectory.extras[name] for name in extras})
         for trajectory in part.trajectories
     ]
-    return make_part(
-        WantedPart(settings=plan.recipe.unit_settings(), task=task, step=part.step), trajectories
-    )
+    return make_part(WantedPart(settings=recipe.unit_settings(), task=task, step=part.step), trajectories)
 
 
 def _tasks_of_file(file: Path) -> dict[int, Task]:
@@ -385,9 +334,6 @@ def _path_digest(path: Path, files: Sequence[Path]) -> list[str]:
     """Name and sha256 of a path of the command line, as they stand in the origin of a run.
 
     A folder's is that of the names and digests of the files that are read of it, since there may be many.
-
-    Raises:
-        StoreError: a file cannot be read.
     """
     name = printable(path.resolve().name)
     if len(files) == 1 and files[0] == path.resolve():
@@ -396,8 +342,5 @@ def _path_digest(path: Path, files: Sequence[Path]) -> list[str]:
 
 
 def _file_digest(file: Path) -> str:
-    try:
-        with file.open("rb") as opened:
-            return hashlib.file_digest(opened, "sha256").hexdigest()
-    except OSError as error:
-        raise StoreError(f"{printable(str(file))} cannot be read ({one_line(error)})") from None
+    with damage_at(f"{printable(str(file))} cannot be read:"), file.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()

@@ -18,7 +18,6 @@ rank 1 become further per-step arrays without their first row, which is the rese
 import contextlib
 import json
 import os
-import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.metadata import version
@@ -41,7 +40,7 @@ from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
-from tcmrl_data.interchange.exporting import Format, require_room_for, stored_episodes, task_attributes
+from tcmrl_data.interchange.exporting import Format
 from tcmrl_data.interchange.hdf5_file import Hdf5File
 from tcmrl_data.interchange.reader import (
     EpisodeCuts,
@@ -51,11 +50,9 @@ from tcmrl_data.interchange.reader import (
     ReadPart,
     Say,
     described_task,
-    episode_of,
-    extras_of,
-    last_flags,
     parts_of_task,
     require_file,
+    stored_episode,
 )
 from tcmrl_data.recipe.about import AND
 from tcmrl_data.store.keys import PartKey
@@ -63,14 +60,11 @@ from tcmrl_data.store.keys import PartKey
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer
 
-LAYOUT, FORMAT_VERSION = "tcmrl-minari", 1
 METADATA_KEY = "tcmrl"
 STEP_ATTRIBUTE = "snapshot_step"
 METADATA, CONTENT = "metadata.json", "main_data.hdf5"
 NEEDED_BY_TASKS = ("tcmrl", "gymnasium", "mujoco", "metaworld")
 """Packages without which a task cannot be made again."""
-
-_EPISODE = re.compile(r"episode_([0-9]{1,9})")
 
 
 @final
@@ -95,20 +89,15 @@ class MinariFormat(Format):
         import minari
 
         dataset, name = selection.dataset, self.place(selection, task)
-        root = path.parents[name.count("/")]
-        require_room_for(path.with_name("namespace_metadata.json"))
-        with _datasets_path(root):
+        with _datasets_path(path.parents[name.count("/")]):
             with warnings.catch_warnings():
                 warnings.filterwarnings("ignore", ".* (is set to|is) None", UserWarning)  # what is unknown
                 written = minari.create_dataset_from_buffers(name, [], **_description(selection, task))
             source, _ = _best(dataset.references(task.index))
-            attributes = task_attributes(selection, task, layout=LAYOUT, version=FORMAT_VERSION)
             written.storage.update_metadata(
-                {"ref_max_score_source": source, METADATA_KEY: json.dumps(attributes)}
+                {"ref_max_score_source": source, METADATA_KEY: json.dumps(self.attributes(selection, task))}
             )
-            for key in selection.parts[task.index]:
-                trajectories = stored_episodes(dataset, key, format_name="Minari")
-                require_room_for(path / "data" / "main_data.hdf5", trajectories)
+            for key, trajectories in self.parts(selection, task, path / "data" / CONTENT):
                 first = written.total_episodes
                 written.update_dataset_from_buffer(
                     [_buffer(dataset, key, index, episode) for index, episode in enumerate(trajectories)]
@@ -255,62 +244,53 @@ class MinariReader(Reader):
 
     def read(self, path: Path, say: Say | None = None) -> Iterator[ReadPart]:
         content, metadata = self.files(path)
-        task, about = _task(metadata)
+        task = _task(metadata)
         cuts = EpisodeCuts()
         with Hdf5File(content) as file:
-            names = [name for name in file.members("/") if _EPISODE.fullmatch(name)]
-            names.sort(key=lambda name: int(name.removeprefix("episode_")))
             episodes = (
-                (file.index(f"/{name}", STEP_ATTRIBUTE, 0), self._episode(file, f"/{name}", cuts))
-                for name in names
+                (
+                    file.step(f"/{name}", STEP_ATTRIBUTE),
+                    stored_episode(
+                        _arrays(file, f"/{name}", self.options.keys()), cuts=cuts, place=f"{content}: /{name}"
+                    ),
+                )
+                for name in file.numbered("/", "episode_")
             )
-            yield from parts_of_task(episodes, task, about, place=str(content))
+            yield from parts_of_task(episodes, task, place=str(content))
         cuts.tell(say, path)
 
-    def _episode(self, file: Hdf5File, group: str, cuts: EpisodeCuts) -> Trajectory:
-        place = f"{file.path}: {group}"
-        flags = last_flags(file.array(f"{group}/terminations"), file.array(f"{group}/truncations"), place)
-        rewards = file.array(f"{group}/rewards")
-        return episode_of(
-            _columns(file, f"{group}/observations", self.options.keys()),
-            _columns(file, f"{group}/actions", None),
-            rewards,
-            ended=flags,
-            extras=_infos(file, group, steps=len(rewards)),
-            cuts=cuts,
-            place=place,
-        )
+
+def _arrays(file: Hdf5File, group: str, keys: Sequence[str] | None) -> dict[str, npt.NDArray[Any]]:
+    """The arrays of an episode by the names of `Trajectory`; infos without the row of the reset."""
+    actions = file.columns(f"{group}/actions", None)
+    infos = f"{group}/infos"
+    names = [name for name in file.members(infos) if file.rank(f"{infos}/{name}") == 1]
+    further = {name: file.array(f"{infos}/{name}") for name in names}
+    further = {
+        name: values[1:] if len(values) == len(actions) + 1 else values for name, values in further.items()
+    }
+    return {
+        **{name: values for name, values in further.items() if len(values) == len(actions)},
+        "observations": file.columns(f"{group}/observations", keys),
+        "actions": actions,
+        "rewards": file.array(f"{group}/rewards"),
+        "terminated": file.array(f"{group}/terminations"),
+        "truncated": file.array(f"{group}/truncations"),
+    }
 
 
-def _task(file: Path) -> tuple[int | None, FileTask]:
+def _task(file: Path) -> FileTask:
     """The task of a dataset that was exported here; nothing for any other."""
     try:
         values = parse_json(read_plain_file(file, limit=MAX_JSON_BYTES).replace(b"Infinity", b"0"))
+        if not isinstance(values, dict):
+            raise ValueError("no table")
     except (OSError, ValueError) as error:
         raise StoreError(f"{file}: not Minari's metadata ({one_line(error)})") from None
-    if not isinstance(values, dict):
-        raise StoreError(f"{file}: not Minari's metadata (no table)")
     if values.get("data_format", "hdf5") != "hdf5":
         found = repr(values["data_format"])[:40]
         raise StoreError(
             f"{file}: data_format is {found}, only hdf5 is read; convert the dataset with Minari"
         )
     text = values.get(METADATA_KEY)
-    if text is None:
-        return None, FileTask()
-    return described_task(text, version=FORMAT_VERSION, place=str(file))
-
-
-def _columns(file: Hdf5File, path: str, keys: Sequence[str] | None) -> npt.NDArray[Any]:
-    """An array of (rows, columns), or those of a group side by side."""
-    return file.columns(path, keys or file.members(path)) if file.is_group(path) else file.array(path)
-
-
-def _infos(file: Hdf5File, group: str, *, steps: int) -> dict[str, npt.NDArray[Any]]:
-    """Infos that a part may have, without the row of the reset."""
-    if not file.is_group(f"{group}/infos"):
-        return {}
-    names = [name for name in file.members(f"{group}/infos") if file.rank(f"{group}/infos/{name}") == 1]
-    arrays = {name: file.array(f"{group}/infos/{name}") for name in names}
-    kept = {name: array[1:] if len(array) == steps + 1 else array for name, array in arrays.items()}
-    return extras_of({name: array for name, array in kept.items() if len(array) == steps})
+    return FileTask() if text is None else described_task(text, place=str(file))

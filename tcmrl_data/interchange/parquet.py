@@ -34,35 +34,25 @@ from tcmrl_data.envs.tasks import Task
 from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.disk import named_errors
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.plain_files import one_line
-from tcmrl_data.interchange.exporting import (
-    REMEDY,
-    Format,
-    require_room_for,
-    stored_episodes,
-    task_attributes,
-)
+from tcmrl_data.interchange.exporting import REMEDY, Format, transitions
 from tcmrl_data.interchange.reader import (
     EpisodeCuts,
     FileTask,
     Reader,
     ReadPart,
     Say,
+    damage_at,
     decoded_limit,
     described_task,
-    episode_of,
-    extras_of,
-    joined_observations,
-    last_flags,
     parts_of_task,
     require_file,
+    stored_episode,
 )
 from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
     import pyarrow
 
-LAYOUT, FORMAT_VERSION = "tcmrl-parquet", 1
 METADATA_KEY = "tcmrl"
 GROUP_ROWS = 2**16
 """Rows of a row group, or up to a part more: what is in memory at a time."""
@@ -70,7 +60,17 @@ GROUP_ROWS = 2**16
 INDEX_COLUMNS = ["task", "step", "run", "episode", "time"]
 SETTINGS = {"compression": "zstd", "use_dictionary": INDEX_COLUMNS, "write_statistics": INDEX_COLUMNS}
 
-NEEDED = ("episode", "observation", "action", "reward", "next_observation", "terminated", "truncated")
+COLUMNS = {
+    "observations": "observation",
+    "actions": "action",
+    "rewards": "reward",
+    "next_observations": "next_observation",
+    "terminated": "terminated",
+    "truncated": "truncated",
+}
+"""Of the arrays of an episode."""
+
+NEEDED = ("episode", *COLUMNS.values())
 STEP = "step"
 UNUSED = ("task", "run", "time")
 """What the metadata and the order of rows say too, or a dataset has no place for."""
@@ -82,38 +82,30 @@ ITEM_BYTES = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4}
 Rows = Mapping[str, npt.NDArray[Any]]
 """Columns by name, of (rows,), or of (rows, width) where they hold lists."""
 
-_ERRORS = (OSError, RuntimeError, ValueError, TypeError, LookupError, OverflowError, MemoryError)
-"""What pyarrow raises for damaged files."""
-
 
 @final
 class ParquetFormat(Format):
     """One file per task; an episode without steps is a `StoreError`."""
 
     name = "parquet"
+    suffix = ".parquet"
     optional_packages = ("pyarrow",)
     extra = "tcmrl[parquet]"
-
-    def place(self, selection: Selection, task: Task) -> str:
-        return f"task_{task.index:05d}.parquet"
 
     def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
         from pyarrow import concat_tables, parquet
 
-        attributes = task_attributes(selection, task, layout=LAYOUT, version=FORMAT_VERSION)
+        metadata = {METADATA_KEY: json.dumps(self.attributes(selection, task))}
         writer: parquet.ParquetWriter | None = None
         waiting: list[pyarrow.Table] = []
         episodes = 0
-        require_room_for(path)
         with named_errors(path, remedy=REMEDY), contextlib.ExitStack() as stack:
             file = stack.enter_context(path.open("xb"))
-            for key in selection.parts[task.index]:
-                trajectories = stored_episodes(selection.dataset, key, format_name="Parquet")
-                require_room_for(path, trajectories)
+            for key, trajectories in self.parts(selection, task, path):
                 waiting.append(_table(trajectories, key, first=episodes))
                 episodes += len(trajectories)
                 if writer is None:
-                    schema = waiting[0].schema.with_metadata({METADATA_KEY: json.dumps(attributes)})
+                    schema = waiting[0].schema.with_metadata(metadata)
                     writer = stack.enter_context(parquet.ParquetWriter(file, schema, **SETTINGS))
                 if sum(map(len, waiting)) >= GROUP_ROWS:
                     writer.write_table(concat_tables(waiting))
@@ -127,35 +119,26 @@ def _table(trajectories: Sequence[Trajectory], key: PartKey, *, first: int) -> "
     """The rows of a part; `first` numbers its first episode."""
     import pyarrow
 
-    lengths = [len(trajectory) for trajectory in trajectories]
-    rows = sum(lengths)
-    observations = [trajectory.observations for trajectory in trajectories]
+    arrays = transitions(trajectories, first=first, step=key.step)
+    episode, step = (arrays.pop(name).astype(np.int32) for name in ("episode", "step"))
     columns = {
-        "task": pyarrow.array(np.full(rows, key.task, np.int32)),
-        "step": pyarrow.array(np.full(rows, key.step, np.int32)),
-        "run": pyarrow.array([key.run]).take(pyarrow.array(np.zeros(rows, np.int8))),
-        "episode": pyarrow.array(np.repeat(np.arange(first, first + len(lengths), dtype=np.int32), lengths)),
-        "time": pyarrow.array(np.concatenate([np.arange(length, dtype=np.int32) for length in lengths])),
-        "observation": _lists([rows[:-1] for rows in observations]),
-        "action": _lists([trajectory.actions for trajectory in trajectories]),
-        "reward": pyarrow.array(np.concatenate([trajectory.rewards for trajectory in trajectories])),
-        "next_observation": _lists([rows[1:] for rows in observations]),
-        "terminated": pyarrow.array(np.concatenate([trajectory.terminated for trajectory in trajectories])),
-        "truncated": pyarrow.array(np.concatenate([trajectory.truncated for trajectory in trajectories])),
+        "task": pyarrow.array(np.full_like(step, key.task)),
+        "step": pyarrow.array(step),
+        "run": pyarrow.array([key.run]).take(pyarrow.array(np.zeros_like(step))),
+        "episode": pyarrow.array(episode),
+        "time": pyarrow.array(np.concatenate([np.arange(len(one), dtype=np.int32) for one in trajectories])),
     }
-    for name in trajectories[0].extras:
-        columns[name] = pyarrow.array(
-            np.concatenate([trajectory.extras[name] for trajectory in trajectories])
-        )
+    for name in dict.fromkeys([*COLUMNS, *arrays]):
+        array = arrays[name]
+        columns[COLUMNS.get(name, name)] = _lists(array) if array.ndim == 2 else pyarrow.array(array)
     fields = [pyarrow.field(name, column.type, nullable=False) for name, column in columns.items()]
     return pyarrow.table(columns, schema=pyarrow.schema(fields))
 
 
-def _lists(arrays: Sequence[npt.NDArray[np.float32]]) -> "pyarrow.Array":
+def _lists(rows: npt.NDArray[np.float32]) -> "pyarrow.Array":
     """Rows of equal width as lists."""
     import pyarrow
 
-    rows = np.concatenate(arrays)
     kind = pyarrow.list_(pyarrow.field("element", pyarrow.float32(), nullable=False), rows.shape[1])
     return pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(rows.ravel()), type=kind)
 
@@ -168,30 +151,26 @@ class ParquetReader(Reader):
     optional_packages = ("pyarrow",)
     extra = "tcmrl[parquet]"
 
-    def files(self, path: Path) -> list[Path]:
-        return [require_file(path)]
-
     def read(self, path: Path, say: Say | None = None) -> Iterator[ReadPart]:
         from pyarrow import parquet
 
         limit = decoded_limit(require_file(path).stat().st_size)
-        with _named(path, " does not open as Parquet"):
+        with damage_at(f"{path} does not open as Parquet:"):
             file = parquet.ParquetFile(path)
         names = [field.name for field in file.schema_arrow if _holds_numbers(field.type)]
         missing = [name for name in NEEDED if name not in names]
         if missing:
             raise StoreError(f"{path}: has no column {missing[0]} of numbers, which a row a transition has")
-        with _named(path, ": metadata tcmrl"):
+        with damage_at(f"{path}: metadata tcmrl:"):
             text = ((file.schema_arrow.metadata or {}).get(METADATA_KEY.encode()) or b"").decode()
-        task, about = (
-            described_task(text, version=FORMAT_VERSION, place=str(path)) if text else (None, FileTask())
-        )
+        task = described_task(text, place=str(path)) if text else FileTask()
         cuts = EpisodeCuts()
         batches = _batches(file, [name for name in names if name not in UNUSED], limit, path)
         episodes = (
-            (step, _episode(arrays, cuts, place=str(path))) for step, arrays in _by_episode(batches, path)
+            (step, _episode(rows, cuts, place=f"{path}: episode {number}"))
+            for (step, number), rows in _by_episode(batches, path)
         )
-        yield from parts_of_task(episodes, task, about, place=str(path))
+        yield from parts_of_task(episodes, task, place=str(path))
         cuts.tell(say, path)
 
 
@@ -201,7 +180,7 @@ def _batches(file: Any, names: Sequence[str], limit: int, path: Path) -> Iterato
     Raises:
         StoreError: the values are more than the file's size justifies, or no table of numbers.
     """
-    with _named(path):
+    with damage_at(f"{path}:"):
         groups = [file.metadata.row_group(index) for index in range(file.metadata.num_row_groups)]
         chunks = [group.column(index) for group in groups for index in range(group.num_columns)]
         used = [chunk for chunk in chunks if chunk.path_in_schema.partition(".")[0] in names]
@@ -223,17 +202,6 @@ def _check_size(num_bytes: int, limit: int) -> None:
             "has more values than the file's size justifies; if you trust the file, write it again without "
             "compression"
         )
-
-
-@contextlib.contextmanager
-def _named(path: Path, what: str = "") -> Iterator[None]:
-    """Turns what damaged files cause into an error that names the file."""
-    try:
-        yield
-    except StoreError:
-        raise
-    except _ERRORS as error:
-        raise StoreError(f"{path}{what}: {one_line(error) or type(error).__name__}") from None
 
 
 def _holds_numbers(kind: Any) -> bool:
@@ -261,8 +229,8 @@ def _numbers(column: Any, name: str, widths: dict[str, int]) -> npt.NDArray[Any]
     return found.reshape(len(column), lengths[0])
 
 
-def _by_episode(batches: Iterable[Rows], path: Path) -> Iterator[tuple[int, Rows]]:
-    """The rows of every episode, with its snapshot's step."""
+def _by_episode(batches: Iterable[Rows], path: Path) -> Iterator[tuple[tuple[int, int], Rows]]:
+    """The rows of every episode, with its snapshot's step and its number."""
     waiting: list[Rows] = []
     before: tuple[int, int] | None = None
     for batch in batches:
@@ -271,18 +239,17 @@ def _by_episode(batches: Iterable[Rows], path: Path) -> Iterator[tuple[int, Rows
         if {numbers.dtype.kind, steps.dtype.kind} - set("iu") or numbers.ndim != 1 or steps.ndim != 1:
             raise StoreError(f"{path}: columns episode and step are no integers")
         starts = np.flatnonzero((numbers[1:] != numbers[:-1]) | (steps[1:] != steps[:-1])) + 1
-        bounds = [0, *starts.tolist(), len(numbers)]
-        for start, stop in itertools.pairwise(bounds):
+        for start, stop in itertools.pairwise([0, *starts.tolist(), len(numbers)]):
             if start == stop:
                 continue
             key = (int(steps[start]), int(numbers[start]))
             if before is not None and key != before:
-                yield before[0], _joined(waiting)
+                yield before, _joined(waiting)
                 waiting = []
             before = key
             waiting.append({name: array[start:stop] for name, array in batch.items()})
     if before is not None:
-        yield before[0], _joined(waiting)
+        yield before, _joined(waiting)
 
 
 def _joined(pieces: list[Rows]) -> Rows:
@@ -290,17 +257,9 @@ def _joined(pieces: list[Rows]) -> Rows:
 
 
 def _episode(rows: Rows, cuts: EpisodeCuts, *, place: str) -> Trajectory:
-    place = f"{place}: episode {int(rows['episode'][0])}"
     for name in ("observation", "action", "next_observation"):
         if rows[name].ndim != 2:
             raise StoreError(f"{place}: column {name} has no lists")
-    further = {name: array for name, array in rows.items() if name not in (*NEEDED, STEP)}
-    return episode_of(
-        joined_observations(rows["observation"], rows["next_observation"], place=place),
-        rows["action"],
-        rows["reward"],
-        ended=last_flags(rows["terminated"], rows["truncated"], place),
-        extras=extras_of(further),
-        cuts=cuts,
-        place=place,
-    )
+    arrays = {name: array for name, array in rows.items() if name not in (*NEEDED, STEP)}
+    arrays |= {name: rows[column] for name, column in COLUMNS.items()}
+    return stored_episode(arrays, cuts=cuts, place=place)

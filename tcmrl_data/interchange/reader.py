@@ -5,8 +5,11 @@ decodes no more than a stated multiple of their size (`decoded_limit`).
 """
 
 import abc
+import contextlib
 import itertools
+import pickle
 import re
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,8 +29,13 @@ from tcmrl_data.store.keys import MAX_INDEX
 from tcmrl_data.store.part import ARRAY_NAME, STANDARD_ARRAYS
 
 Array = npt.NDArray[Any]
+Say = Callable[[str], None]
+"""Takes what a user should know of a file, such as episodes that were cut."""
 
-_NAME = re.compile(ARRAY_NAME)
+FORMAT_VERSION = 1
+"""Of all layouts that exports write and imports read back."""
+
+EPISODE_ARRAYS = tuple(name for name in STANDARD_ARRAYS if name != "episode_offsets")
 
 FLOOR_BYTES = 4 * 2**20
 """What may be decoded of a file whatever its size."""
@@ -35,8 +43,11 @@ FLOOR_BYTES = 4 * 2**20
 LARGEST_RATIO = 4
 """Bytes that may be decoded for each byte of a file; numbers as the field records them seldom reach two."""
 
-Say = Callable[[str], None]
-"""Takes what a user should know of a file, such as episodes that were cut."""
+DAMAGE = (
+    *(OSError, RuntimeError, ValueError, TypeError, LookupError, AttributeError, EOFError),
+    *(OverflowError, MemoryError, SystemError, zlib.error, pickle.UnpicklingError),
+)
+"""What h5py, pyarrow and pickle raise for damaged files."""
 
 
 class ReaderOptions(BaseModel):
@@ -62,13 +73,9 @@ class ObservationOptions(ReaderOptions):
 
 @dataclass(frozen=True)
 class FileTask:
-    """What a file says of a task.
+    """What a file says of a task: None, or no parameters, where it does not say."""
 
-    Attributes:
-        split: None where the file does not say.
-        parameters: empty where the file does not say.
-    """
-
+    index: int | None = None
     split: Split | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict)
 
@@ -78,16 +85,13 @@ class ReadPart:
     """Episodes that become one part.
 
     Attributes:
-        task: index of the task; None where the file does not say.
         step: snapshot step; 0 where the file does not say.
         trajectories: at least one; every episode ends with a flag, and no flag is set before.
-        about: what the file says of the task.
     """
 
-    task: int | None
+    task: FileTask
     step: int
     trajectories: Sequence[Trajectory]
-    about: FileTask = field(default_factory=FileTask)
 
 
 class Reader(abc.ABC):
@@ -106,19 +110,17 @@ class Reader(abc.ABC):
     def __init__(self, options: ReaderOptions | None = None) -> None:
         self.options = self.Options() if options is None else options
 
-    @abc.abstractmethod
     def files(self, path: Path) -> list[Path]:
-        """The files that will be read for a path of the command line, sorted.
+        """The files that will be read for a path of the command line, sorted; here, the path is the file.
 
         Raises:
             StoreError: there is nothing of this format at the path.
         """
+        return [require_file(path)]
 
     @abc.abstractmethod
     def read(self, path: Path, say: Say | None = None) -> Iterator[ReadPart]:
         """Yields the parts of a path, one in memory at a time, in the same order every time.
-
-        What the file does not say stays open: `ReadPart` says how.
 
         Args:
             path: a file or folder, whichever the format has.
@@ -144,27 +146,39 @@ def require_file(path: Path) -> Path:
     Raises:
         StoreError: it is missing or no regular file.
     """
+    shown = printable(str(path))
     try:
         resolved = path.resolve(strict=True)
         problem = file_problem(resolved.stat())
     except (OSError, RuntimeError) as error:
-        shown = printable(str(path))
         raise StoreError(f"{shown} cannot be read ({one_line(error)}); name a file that can") from None
     if problem is not None:
-        raise StoreError(f"{printable(str(path))} {problem}; name a file")
+        raise StoreError(f"{shown} {problem}; name a file")
     return resolved
+
+
+@contextlib.contextmanager
+def damage_at(place: str) -> Iterator[None]:
+    """Turns what libraries raise for damaged files into an error that begins with a place.
+
+    Raises:
+        StoreError: instead of any of `DAMAGE`.
+    """
+    try:
+        yield
+    except DAMAGE as error:
+        raise StoreError(f"{place} {one_line(error) or type(error).__name__}") from None
 
 
 TASK_ATTRIBUTES = ("format_version", "task", "split", "parameters")
 """What `described_task` reads of the attributes that exports write."""
 
 
-def described_task(attributes: Any, *, version: int, place: str) -> tuple[int, FileTask]:
-    """Index and description of the task that an exported file names.
+def described_task(attributes: Any, *, place: str) -> FileTask:
+    """The task that an exported file names.
 
     Args:
         attributes: numbers and texts by name, or JSON text of them.
-        version: of the format, which is read here.
         place: the file, for error messages.
 
     Raises:
@@ -172,22 +186,33 @@ def described_task(attributes: Any, *, version: int, place: str) -> tuple[int, F
     """
     try:
         found = parse_json(attributes.encode()) if isinstance(attributes, str) else attributes
-        written, index, split, text = (found[name] for name in TASK_ATTRIBUTES)
+        version, index, split, text = (found[name] for name in TASK_ATTRIBUTES)
         parameters: Any = parse_json(text.encode())
     except (ValueError, KeyError, TypeError, AttributeError):
         raise StoreError(f"{place}: its attributes do not describe a task") from None
-    if written != version:
-        raise StoreError(f"{place}: format_version {repr(written)[:40]} is not {version}, which is read here")
-    if not isinstance(index, int) or isinstance(index, bool) or not 0 <= index < MAX_INDEX:
-        raise StoreError(f"{place}: task is {repr(index)[:40]}, not an index")
+    if version != FORMAT_VERSION:
+        raise StoreError(
+            f"{place}: format_version {repr(version)[:40]} is not {FORMAT_VERSION}, which is read here"
+        )
     if not isinstance(parameters, dict) or split not in ("train", "test"):
         raise StoreError(f"{place}: parameters and split are not those of a task")
-    return index, FileTask("test" if split == "test" else "train", parameters)
+    return FileTask(checked_index(index, f"{place}: task"), split, parameters)
+
+
+def checked_index(value: Any, place: str) -> int:
+    """A value, if it is the index of a task or the step of a snapshot.
+
+    Raises:
+        StoreError: it is not.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or not 0 <= value < MAX_INDEX:
+        raise StoreError(f"{place} is {repr(value)[:40]}, not an index")
+    return value
 
 
 @dataclass
 class EpisodeCuts:
-    """What was cut of a file's episodes.
+    """Counts what was cut of a file's episodes.
 
     Attributes:
         broken: episodes that end where the next observation is not that of the next row.
@@ -211,15 +236,7 @@ class EpisodeCuts:
 
 
 def episodes_of_rows(
-    *,
-    observations: Array,
-    actions: Array,
-    rewards: Array,
-    terminals: Array,
-    timeouts: Array | None,
-    next_observations: Array | None,
-    cuts: EpisodeCuts,
-    place: str,
+    arrays: Mapping[str, Array | None], *, cuts: EpisodeCuts, place: str
 ) -> list[Trajectory]:
     """The episodes of rows of steps that lie behind one another.
 
@@ -228,48 +245,45 @@ def episodes_of_rows(
     episode, so that its step is left out.
 
     Args:
-        observations: (N, observation_dim).
-        actions: (N, action_dim).
-        rewards: (N,) or (N, 1).
-        terminals: (N,), nonzero where the task ended the episode.
-        timeouts: (N,), nonzero where a time limit did; None where the file does not say.
-        next_observations: (N, observation_dim).
+        arrays: by D4RL's names. `observations` (N, observation_dim), `actions` (N, action_dim), `rewards`
+            (N,) or (N, 1); where the file has them, `terminals` and `timeouts` (N,), nonzero where the task
+            or a time limit ended the episode, and `next_observations`.
         cuts: counts what is cut.
         place: file and member, for error messages.
 
     Raises:
         StoreError: arrays of other shapes, or values that are no finite float32.
     """
-    rows = len(observations)
-    arrays = {"actions": actions, "rewards": rewards, "terminals": terminals, "timeouts": timeouts}
-    arrays |= {"next_observations": next_observations}
-    for name, array in arrays.items():
-        if array is not None and len(array) != rows:
+    present = {name: array for name, array in arrays.items() if array is not None}
+    observations, actions, rewards = (present[name] for name in ("observations", "actions", "rewards"))
+    following, rows = present.get("next_observations"), len(observations)
+    for name, array in present.items():
+        if len(array) != rows:
             raise StoreError(f"{place}: {name} has {len(array)} rows, observations have {rows}")
     if rows == 0:
         raise StoreError(f"{place}: holds no steps")
-    terminated = _flags(terminals, rows, f"{place}: terminals")
-    truncated = _flags(timeouts, rows, f"{place}: timeouts") if timeouts is not None else np.zeros(rows, bool)
+    terminated, truncated = (
+        _flags(present.get(name, np.zeros(rows, dtype=bool)), f"{place}: {name}")
+        for name in ("terminals", "timeouts")
+    )
     ends = terminated | truncated
-    if next_observations is not None:
-        if next_observations.shape != observations.shape:
+    if following is not None:
+        if following.shape != observations.shape:
             raise StoreError(
-                f"{place}: next_observations have shape {next_observations.shape}, observations "
-                f"{observations.shape}"
+                f"{place}: next_observations have shape {following.shape}, observations {observations.shape}"
             )
-        breaks = (next_observations[:-1] != observations[1:]).reshape(rows - 1, -1).any(axis=1) & ~ends[:-1]
+        breaks = (following[:-1] != observations[1:]).reshape(rows - 1, -1).any(axis=1) & ~ends[:-1]
         cuts.broken += int(breaks.sum())
         ends[:-1] |= breaks
     ends[-1] = True
     trajectories = []
     start = 0
     for end in np.flatnonzero(ends).tolist():
-        stop = end + 1
-        if next_observations is None:
+        if following is None:
             seen, stop = observations[start : end + 1], end
             cuts.shortened += 1
         else:
-            seen = np.concatenate([observations[start:stop], next_observations[end : end + 1]])
+            seen, stop = np.concatenate([observations[start : end + 1], following[end : end + 1]]), end + 1
         if stop > start:
             step = slice(start, stop)
             last = (bool(terminated[stop - 1]), bool(truncated[stop - 1]))
@@ -307,12 +321,12 @@ def episode_of(
         StoreError: arrays that form no episode, values that are no finite float32, or actions beyond [-1, 1].
     """
     steps = len(actions)
-    terminated, truncated = np.zeros((2, steps), dtype=bool)
     if steps == 0:
         raise StoreError(f"{place}: holds an episode without steps")
-    if ended == (False, False):
+    if not any(ended):
         cuts.unflagged += 1
         ended = (False, True)
+    terminated, truncated = np.zeros((2, steps), dtype=bool)
     terminated[-1], truncated[-1] = ended
     if rewards.ndim == 2 and rewards.shape[1] == 1:
         rewards = rewards[:, 0]
@@ -336,12 +350,69 @@ def episode_of(
     return made
 
 
-def joined_observations(observations: Array, following: Array, *, place: str) -> Array:
-    """The observations of an episode, (T + 1, observation_dim), from those before and after every step.
+def stored_episode(arrays: Mapping[str, Array], *, cuts: EpisodeCuts, place: str) -> Trajectory:
+    """The episode of a file that keeps every episode apart, with the flags of every step.
+
+    Args:
+        arrays: by the names of `Trajectory`; with `next_observations`, both have a row for each step. Further
+            arrays of numbers of (T,) become the episode's own: floats as float32, integers as int64. They are
+            left out where a value is not finite, or a part cannot have their names.
+        cuts: counts an episode without a flag.
+        place: file and member, for error messages.
 
     Raises:
-        StoreError: other shapes, or a row that does not begin where the row before it ends.
+        StoreError: an array is missing, a flag is set before the last step, a row does not begin where the
+            one before it ends, or the errors of `episode_of`.
     """
+    for name in EPISODE_ARRAYS:
+        if name not in arrays:
+            raise StoreError(f"{place}/{name} is missing")
+    observations, following = arrays["observations"], arrays.get("next_observations")
+    if following is not None:
+        observations = _joined(observations, following, place)
+    ended = []
+    for name in ("terminated", "truncated"):
+        flags = _flags(arrays[name], f"{place}: {name}")
+        if flags[:-1].any():
+            raise StoreError(f"{place}: {name} is set before the episode's last step")
+        ended.append(bool(flags[-1:].any()))
+    further = {name: array for name, array in arrays.items() if name not in STANDARD_ARRAYS}
+    return episode_of(
+        observations,
+        arrays["actions"],
+        arrays["rewards"],
+        ended=(ended[0], ended[1]),
+        extras={name: kept for name, array in further.items() if (kept := _extra(name, array)) is not None},
+        cuts=cuts,
+        place=place,
+    )
+
+
+def parts_of_task(
+    episodes: Iterable[tuple[int, Trajectory]], task: FileTask, *, place: str
+) -> Iterator[ReadPart]:
+    """The parts of a task, one for each snapshot step.
+
+    Args:
+        episodes: steps and episodes, in the order of the file; those of a step stand behind one another.
+        task: what the file says of it.
+        place: the file, for error messages.
+
+    Raises:
+        StoreError: there is no episode, or a step comes back after another one.
+    """
+    done: set[int] = set()
+    for step, group in itertools.groupby(episodes, key=lambda pair: pair[0]):
+        if step in done:
+            raise StoreError(f"{place}: the episodes of step {step} do not stand behind one another")
+        done.add(step)
+        yield ReadPart(task, step, [trajectory for _, trajectory in group])
+    if not done:
+        raise StoreError(f"{place}: holds no episode")
+
+
+def _joined(observations: Array, following: Array, place: str) -> Array:
+    """(T + 1, observation_dim) from the observations before and after every step."""
     if observations.ndim != 2 or observations.shape != following.shape or not len(following):
         raise StoreError(
             f"{place}: observations before and after the steps have shapes {observations.shape} and "
@@ -354,74 +425,23 @@ def joined_observations(observations: Array, following: Array, *, place: str) ->
     return np.concatenate([observations, following[-1:]])
 
 
-def last_flags(terminated: Array, truncated: Array, place: str) -> tuple[bool, bool]:
-    """The flags of an episode's last step.
-
-    Raises:
-        StoreError: a flag is set before the last step.
-    """
-    found = []
-    for name, flags in (("terminated", terminated), ("truncated", truncated)):
-        values = _flags(flags, len(flags), f"{place}: {name}")
-        if values[:-1].any():
-            raise StoreError(f"{place}: {name} is set before the episode's last step")
-        found.append(bool(values[-1:].any()))
-    return found[0], found[1]
+def _extra(name: str, values: Array) -> Array | None:
+    """A further array as a part may have it; None where it may not."""
+    if values.ndim != 1 or values.dtype.kind not in "biuf" or not re.fullmatch(ARRAY_NAME, name):
+        return None
+    with np.errstate(over="ignore"):
+        made: Array = values.astype({"b": np.bool_, "f": np.float32}.get(values.dtype.kind, np.int64))
+    return made if np.isfinite(made).all() else None
 
 
-def extras_of(arrays: Mapping[str, Array]) -> dict[str, Array]:
-    """The further per-step arrays that a part may have: of numbers, of rank 1, with a name of its kind.
-
-    Floats become float32, integers int64; what is not finite as float32 is left out.
-    """
-    kept = {}
-    for name, values in arrays.items():
-        kind = values.dtype.kind
-        if values.ndim != 1 or kind not in "biuf" or name in STANDARD_ARRAYS or not _NAME.fullmatch(name):
-            continue
-        with np.errstate(over="ignore"):
-            made: Array = values.astype({"b": np.bool_, "f": np.float32}.get(kind, np.int64))
-        if np.isfinite(made).all():
-            kept[name] = made
-    return kept
-
-
-def parts_of_task(
-    episodes: Iterable[tuple[int, Trajectory]], task: int | None, about: FileTask, *, place: str
-) -> Iterator[ReadPart]:
-    """The parts of a task, one for each snapshot step.
-
-    Args:
-        episodes: steps and episodes, in the order of the file; those of a step stand behind one another.
-        task: index of the task.
-        about: what the file says of it.
-        place: the file, for error messages.
-
-    Raises:
-        StoreError: there is no episode, or a step comes back after another one.
-    """
-    done: set[int] = set()
-    for step, group in itertools.groupby(episodes, key=lambda pair: pair[0]):
-        if step in done:
-            raise StoreError(f"{place}: the episodes of step {step} do not stand behind one another")
-        done.add(step)
-        yield ReadPart(task, step, [trajectory for _, trajectory in group], about)
-    if not done:
-        raise StoreError(f"{place}: holds no episode")
-
-
-def _flags(values: Array, rows: int, place: str) -> npt.NDArray[np.bool_]:
+def _flags(values: Array, place: str) -> npt.NDArray[np.bool_]:
+    rows = len(values)
     if values.shape not in ((rows,), (rows, 1)):
         raise StoreError(f"{place}: has shape {values.shape}, expected ({rows},)")
     return np.asarray(values.reshape(rows) != 0, dtype=np.bool_)
 
 
 def _floats(values: Array, place: str) -> npt.NDArray[np.float32]:
-    """Numbers as the float32 of a dataset.
-
-    Raises:
-        StoreError: a value that is not finite there.
-    """
     with np.errstate(over="ignore", invalid="ignore"):
         made = np.ascontiguousarray(values, dtype=np.float32)
     if not np.isfinite(made).all():

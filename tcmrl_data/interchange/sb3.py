@@ -7,6 +7,7 @@ from gymnasium.spaces import Box
 
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.interchange.exporting import transitions
 
 if TYPE_CHECKING:
     from stable_baselines3.common.buffers import ReplayBuffer
@@ -34,27 +35,22 @@ def to_sb3_buffer(selection: Selection, task: int, *, device: str = "cpu") -> "R
     from stable_baselines3.common.buffers import ReplayBuffer
 
     trajectories = selection.trajectories(task) if task in selection.parts else []
-    size = sum(map(len, trajectories))
-    if not size:
+    if not any(map(len, trajectories)):
         raise SelectionError(
             f"{selection.dataset.folder}: the selection holds no transition of task {task}; it has the tasks "
             f"{sorted(selection.parts)}"
         )
+    rows = transitions(trajectories)
     environment = selection.dataset.environment
     buffer = ReplayBuffer(
-        size,
+        len(rows["rewards"]),
         Box(-np.inf, np.inf, (environment.observation_dim,), np.float32),
         Box(-1.0, 1.0, (environment.action_dim,), np.float32),
         device=device,
     )
-    row = 0
-    for trajectory in trajectories:
-        rows = slice(row, row := row + len(trajectory))
-        buffer.observations[rows, 0] = trajectory.observations[:-1]
-        buffer.next_observations[rows, 0] = trajectory.observations[1:]
-        buffer.actions[rows, 0] = trajectory.actions
-        buffer.rewards[rows, 0] = trajectory.rewards
-        buffer.dones[rows, 0] = trajectory.terminated | trajectory.truncated
-        buffer.timeouts[rows, 0] = trajectory.truncated & ~trajectory.terminated
+    for name in ("observations", "next_observations", "actions", "rewards"):
+        getattr(buffer, name)[:, 0] = rows[name]
+    buffer.dones[:, 0] = rows["terminated"] | rows["truncated"]
+    buffer.timeouts[:, 0] = rows["truncated"] & ~rows["terminated"]
     buffer.full = True
     return buffer

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.foundation.errors import MissingPackageError
+from tcmrl_data.interchange.exporting import require_packages, transitions
+from tcmrl_data.interchange.reader import EPISODE_ARRAYS
 
 if TYPE_CHECKING:
     import torch
@@ -36,37 +37,25 @@ def to_tensordict(selection: Selection) -> "TensorDict":
     """
     import torch
 
-    kind = _tensordict_type()
-    episodes = [
-        (task.index, key.step, trajectory)
-        for task in selection.tasks
-        for key in selection.parts[task.index]
-        for trajectory in selection.dataset.trajectories(*key)
-    ]
-    lengths = [len(episode) for _, _, episode in episodes]
-
-    def flat(arrays: list[Any]) -> "torch.Tensor":
-        return torch.from_numpy(np.concatenate(arrays))
-
-    def numbered(numbers: list[int]) -> "torch.Tensor":
-        return torch.from_numpy(np.repeat(np.array(numbers, dtype=np.int64), lengths))
-
-    result: TensorDict = kind(
+    parts: list[dict[str, Any]] = []
+    episodes = 0
+    for key in (key for task in selection.tasks for key in selection.parts[task.index]):
+        arrays = transitions(selection.dataset.trajectories(*key), first=episodes, step=key.step)
+        parts.append(arrays | {"task": np.full_like(arrays["step"], key.task)})
+        episodes += selection.dataset.entry(key).episodes
+    data = {name: torch.from_numpy(np.concatenate([part[name] for part in parts])) for name in _ROWS}
+    size = len(data["rewards"])
+    result: TensorDict = _tensordict_type()(
         {
-            "observation": flat([episode.observations[:-1] for _, _, episode in episodes]),
-            "action": flat([episode.actions for _, _, episode in episodes]),
+            "observation": data["observations"],
+            "action": data["actions"],
             "next": _outcome(
-                flat([episode.observations[1:] for _, _, episode in episodes]),
-                flat([episode.rewards for _, _, episode in episodes]),
-                flat([episode.terminated for _, _, episode in episodes]),
-                flat([episode.truncated for _, _, episode in episodes]),
+                data["next_observations"], data["rewards"], data["terminated"], data["truncated"]
             ),
-            **{name: torch.zeros(sum(lengths), 1, dtype=torch.bool) for name in _FLAGS},
-            "episode": numbered(list(range(len(episodes)))),
-            "task": numbered([task for task, _, _ in episodes]),
-            "step": numbered([step for _, step, _ in episodes]),
+            **{name: torch.zeros(size, 1, dtype=torch.bool) for name in _FLAGS},
+            **{name: data[name] for name in ("episode", "task", "step")},
         },
-        batch_size=[sum(lengths)],
+        batch_size=[size],
     )
     return result
 
@@ -100,6 +89,7 @@ def view_steps(steps: "Steps") -> "TensorDict":
 
 
 _FLAGS = ("done", "terminated", "truncated")
+_ROWS = (*EPISODE_ARRAYS, "next_observations", "episode", "task", "step")
 
 
 def _outcome(
@@ -119,10 +109,7 @@ def _outcome(
 
 
 def _tensordict_type() -> Any:
-    try:
-        from tensordict import TensorDict
-    except ImportError as error:
-        raise MissingPackageError(
-            f"TensorDicts need a package that is missing ({error}); pip install 'tcmrl[tensordict]'"
-        ) from None
+    require_packages("a TensorDict", ("tensordict",), "tcmrl[tensordict]")
+    from tensordict import TensorDict
+
     return TensorDict

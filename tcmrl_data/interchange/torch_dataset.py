@@ -13,6 +13,7 @@ from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Dataset
 
 from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.interchange.exporting import episode_arrays
 from tcmrl_data.store.keys import PartKey
 
 if TYPE_CHECKING:
@@ -80,13 +81,5 @@ class TrajectoryDataset(Dataset[Item]):
 
 
 def _item(trajectory: Trajectory, task: int, step: int) -> Item:
-    arrays = {
-        "observations": trajectory.observations,
-        "actions": trajectory.actions,
-        "rewards": trajectory.rewards,
-        "terminated": trajectory.terminated,
-        "truncated": trajectory.truncated,
-        **trajectory.extras,
-    }
-    item = {name: torch.from_numpy(np.array(array)) for name, array in arrays.items()}
+    item = {name: torch.from_numpy(np.array(array)) for name, array in episode_arrays(trajectory).items()}
     return item | {"task": torch.tensor(task), "step": torch.tensor(step)}

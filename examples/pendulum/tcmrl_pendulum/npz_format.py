@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.tasks import Task
-from tcmrl_data.interchange.exporting import Format
+from tcmrl_data.interchange.exporting import Format, transitions
 from tcmrl_data.store.keys import PartKey
 
 
@@ -30,29 +30,17 @@ class NpzFormat(Format):
     """One archive per task; a whole task is in memory at a time."""
 
     name = "npz"
-
-    def place(self, selection: Selection, task: Task) -> str:
-        return f"task_{task.index:05d}.npz"
+    suffix = ".npz"
+    takes_empty_episodes = True
 
     def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
-        np.savez_compressed(path, allow_pickle=False, **_arrays(selection, task))
-        yield from selection.parts[task.index]
-
-
-def _arrays(selection: Selection, task: Task) -> dict[str, npt.NDArray[Any]]:
-    parts = [(key.step, selection.dataset.trajectories(*key)) for key in selection.parts[task.index]]
-    episodes = [(step, episode) for step, part in parts for episode in part]
-    lengths = [len(episode) for _, episode in episodes]
-    columns = {name: [getattr(episode, name) for _, episode in episodes] for name in _NAMES}
-    columns["observations"] = [episode.observations[:-1] for _, episode in episodes]
-    columns["next_observations"] = [episode.observations[1:] for _, episode in episodes]
-    described = {"index": task.index, "split": task.split, "parameters": dict(task.parameters)}
-    return {
-        **{name: np.concatenate(values) for name, values in columns.items()},
-        "episode": np.repeat(np.arange(len(episodes)), lengths),
-        "snapshot": np.repeat([step for step, _ in episodes], lengths),
-        "task": np.array(json.dumps(described)),
-    }
-
-
-_NAMES = ("actions", "rewards", "terminated", "truncated")
+        parts: list[dict[str, npt.NDArray[Any]]] = []
+        episodes = 0
+        for key, trajectories in self.parts(selection, task, path):
+            parts.append(transitions(trajectories, first=episodes, step=key.step))
+            episodes += len(trajectories)
+            yield key
+        arrays = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        described = {"index": task.index, "split": task.split, "parameters": dict(task.parameters)}
+        arrays["snapshot"] = arrays.pop("step")
+        np.savez_compressed(path, allow_pickle=False, task=np.array(json.dumps(described)), **arrays)
