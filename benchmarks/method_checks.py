@@ -32,14 +32,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from tcmrl_algo import Algorithm, ContextAlgorithm, create_algorithm
+from tcmrl_algo import Algorithm, ContextAlgorithm, RunResult, create_algorithm
 from tcmrl_algo.adaptation.arena import Arena, Context
 from tcmrl_algo.algorithms.borel import BorelLearner, joined_episodes
 from tcmrl_algo.algorithms.csro import CsroLearner
 from tcmrl_algo.algorithms.macaw import MacawLearner
 from tcmrl_algo.algorithms.unicorn import UnicornLearner
 from tcmrl_algo.reporting.contexts import NUM_TASKS, centroid_accuracy
-from tcmrl_algo.reporting.sources import FinishedRun, read_sources
+from tcmrl_algo.reporting.sources import read_sources
 from tcmrl_algo.training.checkpoint import RunRecord, open_run
 from tcmrl_algo.training.config import method_of
 from tcmrl_data import Dataset, Steps, Task, Trajectory
@@ -163,7 +163,7 @@ def variances(learner: BorelLearner, steps: Steps, *, episodes: int) -> Values:
     return {f"after {place} steps": float(found[:, place].mean()) for place in places}
 
 
-def checks(run: FinishedRun, episodes: int) -> Values:
+def checks(run: RunResult, episodes: int) -> Values:
     """The checks of a finished run's method, with contexts of as many episodes."""
     opened = open_run(run.folder)
     dataset = opened.open_dataset()
@@ -216,7 +216,7 @@ def main() -> None:
     found: dict[str, list[Values]] = {}
     (source,) = read_sources([arguments.results], lambda *progress: None)
     for run in source.of(arguments.environment):
-        found.setdefault(run.result.label, []).append(checks(run, arguments.episodes))
+        found.setdefault(run.label, []).append(checks(run, arguments.episodes))
     means = {
         label: {name: round(fmean(one[name] for one in runs), 4) for name in runs[0]} | {"runs": len(runs)}
         for label, runs in found.items()

@@ -29,7 +29,7 @@ from .progress import StageProgress
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tcmrl_algo import EndedRun, Experiment, ExperimentReport, RunResult
+    from tcmrl_algo import Experiment, ExperimentReport, RunResult
 
 NUM_SEEDS = 10_000
 
@@ -152,7 +152,7 @@ def experiment(
             device=device,
             tuned=tuned_settings(loaded, tuned, environments=environments, only=only) if tuned else None,
             reuse=reuse,
-            report=lambda event: remark(_line(event), quiet=quiet),
+            report=lambda *ended: remark(_line(*ended), quiet=quiet),
         )
     if as_json:
         print_json(_document(report))
@@ -205,17 +205,16 @@ def _print_list(*, as_json: bool) -> None:
     print_table(table)
 
 
-def _line(event: "EndedRun") -> str:
-    left = f", about {duration(event.seconds_left)} left" if event.seconds_left else ""
-    if event.result is None:
-        return f"{event.done} of {event.total}: {event.id} failed: {event.error}{left}"
-    result = event.result
+def _line(result: "RunResult | str", done: int, total: int, seconds_left: float | None) -> str:
+    left = f", about {duration(seconds_left)} left" if seconds_left else ""
+    if isinstance(result, str):
+        return f"{done} of {total}: failed: {result}{left}"
     finals = ", ".join(
         f"{protocol} {number(evaluation['mean_final'])}"
         for protocol, evaluation in result.evaluations.items()
     )
     return (
-        f"{event.done} of {event.total}: {result.environment}, {result.method}, seed {result.seed}"
+        f"{done} of {total}: {result.environment}, {result.method}, seed {result.seed}"
         f"{'' if result.fold is None else f', fold {result.fold}'}: {finals}{left}"
     )
 

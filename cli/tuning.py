@@ -27,7 +27,7 @@ from .plugins import ALGORITHM, PROTOCOL_NAME
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tcmrl_algo import EndedTrial, Trial, Tuning, TuningReport
+    from tcmrl_algo import Trial, Tuning, TuningReport
 
 
 @click.command()
@@ -109,7 +109,7 @@ def tune(
       tcmrl tune data/point-robot --algo csro --trials 8 --set optimizer.learning_rate=0.001
     """
     from tcmrl_algo import tune_method
-    from tcmrl_algo.experiment.config import PAPER_PROTOCOLS
+    from tcmrl_algo.experiment.spec import PAPER_PROTOCOLS
     from tcmrl_data import MAX_TASKS, open_dataset, parse_indices
 
     dataset = open_dataset(manifest)
@@ -129,7 +129,7 @@ def tune(
             overrides=overrides,
             workers=workers,
             device=device,
-            report=lambda event: remark(_line(event), quiet=quiet),
+            report=lambda *ended: remark(_line(*ended), quiet=quiet),
         )
     if as_json:
         print_json(report.tuning.model_dump(mode="json") | {"failed": list(report.failed)})
@@ -141,12 +141,9 @@ def tune(
         fail_incomplete(f"{report.failed[0]}{more}; run the same command again to repeat the failed runs")
 
 
-def _line(event: "EndedTrial") -> str:
-    left = f", about {duration(event.seconds_left)} left" if event.seconds_left else ""
-    return (
-        f"{event.done} of {event.total}: trial {event.trial.number}: {_score(event.trial)}; "
-        f"best {_decimals(event.best)}{left}"
-    )
+def _line(trial: "Trial", done: int, total: int, best: float | None, seconds_left: float) -> str:
+    left = f", about {duration(seconds_left)} left" if seconds_left else ""
+    return f"{done} of {total}: trial {trial.number}: {_score(trial)}; best {_decimals(best)}{left}"
 
 
 def _score(trial: "Trial") -> str:

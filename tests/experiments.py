@@ -5,9 +5,8 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_algo import TrainingConfig, resolve, run_experiment, write_report
-from tcmrl_algo.experiment.config import read_experiment, run_id
 from tcmrl_algo.experiment.results import CurvePoint, RunResult
-from tcmrl_algo.experiment.runner import EndedRun
+from tcmrl_algo.experiment.spec import read_experiment, run_id
 from tcmrl_data import load_recipe
 from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.records import write_record
@@ -141,11 +140,13 @@ def made_report(folder: Path) -> Path:
 def run_small(dataset: Path, out: Path) -> None:
     """Runs the small experiment, whose folder is then as `tests/conftest.py` hands it out."""
     experiment = read_experiment(tables(dataset), place="test")
-    events: list[EndedRun] = []
-    report = run_experiment(experiment, out, workers=2, engine=InProcessEngine(), report=events.append)
+    events: list[tuple[Any, ...]] = []
+    report = run_experiment(
+        experiment, out, workers=2, engine=InProcessEngine(), report=lambda *event: events.append(event)
+    )
     assert (report.present, report.failed, len(report.results)) == (0, (), 4)
-    assert [(event.done, event.total) for event in events] == [(done, 4) for done in (1, 2, 3, 4)]
-    assert events[-1].seconds_left == 0
+    assert [event[1:3] for event in events] == [(done, 4) for done in (1, 2, 3, 4)]
+    assert events[-1][3] == 0
 
 
 def write_file(file: Path, content: dict[str, Any]) -> Path:

@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from tcmrl_algo.experiment.config import Claim, Experiment, read_experiment
 from tcmrl_algo.experiment.results import ContextMeasures, RunResult, coverage
+from tcmrl_algo.experiment.spec import Claim, Experiment, read_experiment
 from tcmrl_algo.reporting.claims import Verdict, compare, correct, judge, measure
-from tcmrl_algo.reporting.sources import FinishedRun, Source
+from tcmrl_algo.reporting.sources import Source
 from tcmrl_data import TcmrlError
 from tests import experiments
 from tests.experiments import made_result, with_setting
@@ -104,7 +104,7 @@ def _source(claims: list[dict[str, object]], results: list[RunResult]) -> Source
     content["protocols"] = ["offline", "paper", "idaq"]
     content["methods"] = {"A": {"algorithm": "tcmrl"}, "B": {"algorithm": "focal"}}
     experiment: Experiment = read_experiment(content, place="test")
-    return Source(experiment, tuple(FinishedRun(result, Path("gone")) for result in results))
+    return Source(experiment, tuple(results))
 
 
 def test_a_claim_is_judged_under_every_protocol_unless_it_names_some() -> None:

@@ -2,7 +2,6 @@
 
 import csv
 import json
-import os
 import shutil
 import signal
 import uuid
@@ -17,12 +16,12 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import METHODS, experiment_names, load_experiment, open_run, run_experiment, train_run
-from tcmrl_algo.experiment.config import Experiment, read_experiment
-from tcmrl_algo.experiment.job import Job, code_commit, run_job
-from tcmrl_algo.experiment.planning import plan_runs, resolve_method
-from tcmrl_algo.experiment.results import RunResult, read_results
+from tcmrl_algo.experiment.plan import plan_runs, resolve_method
+from tcmrl_algo.experiment.results import RunResult, read_result, read_results
+from tcmrl_algo.experiment.run import code_commit, run_job
+from tcmrl_algo.experiment.spec import Experiment, read_experiment
 from tcmrl_data import SelectionError, TcmrlError, TrainingError
-from tcmrl_data.foundation.machine import processor
+from tcmrl_data.foundation.machine import available_cores, processor
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
@@ -64,7 +63,7 @@ def test_one_document_per_run_and_one_table(finished: Path, tiny_folder: Path) -
     assert result.evaluations["offline"]["mean_final"] == result.curve[-1].final
     assert result.training_seconds is not None and result.training_seconds > 0
     assert result.peak_memory is not None and result.peak_memory > 50e6
-    assert result.threads == result.config.settings.run.threads == max(1, len(os.sched_getaffinity(0)) // 2)
+    assert result.threads == result.config.settings.run.threads == max(1, available_cores() // 2)
     assert {"torch", "tcmrl"} <= set(result.versions)
     assert result.behavior_seed == tcmrl_data.open_dataset(tiny_folder).manifest.seed
     assert (result.commit, result.processor) == (code_commit(), processor())
@@ -237,9 +236,9 @@ def test_the_list_of_experiments_says_what_each_asks(call: Call) -> None:
 def test_data_may_name_the_one_dataset_itself(tiny_folder: Path, tmp_path: Path) -> None:
     tour = load_experiment("tour")
     with pytest.raises(SelectionError, match=r"--profile quick --out data/demo.*--data"):
-        plan_runs(tour, data=tmp_path)
-    runs = plan_runs(tour, data=tiny_folder)
-    assert {run.dataset for run in runs} == {tiny_folder.resolve()}
+        plan_runs(tour, data=tmp_path, out=tmp_path)
+    runs = plan_runs(tour, data=tiny_folder, out=tmp_path)
+    assert {run.dataset for run in runs} == {str(tiny_folder.resolve())}
     assert len(runs) == 10
 
 
@@ -305,7 +304,7 @@ def test_what_never_began_takes_a_new_device_and_new_threads(
     assert_refused(call(*arguments, "--device", "cudda"), "--device 'cudda'")
     assert not (tmp_path / "out").exists()
     job = tmp_path / "out/runs/point-robot--tcmrl--seed0/job.json"
-    cores = len(os.sched_getaffinity(0))
+    cores = available_cores()
     for workers in (cores, 1):  # the first is killed before its run begins
         assert call(*arguments, "--workers", workers)[0] == 0
         assert json.loads(job.read_text())["config"]["settings"]["run"]["threads"] == cores // workers
@@ -351,21 +350,9 @@ def test_a_missing_experiment_attribute_is_named() -> None:
 def test_points_of_a_curve_name_the_stage_they_lie_in(tiny_folder: Path, tmp_path: Path) -> None:
     method = {"algorithm": "double_stages", "training": {"double_stages": {"model_steps": 20}}}
     experiment = _small(tiny_folder, methods={"staged": method}, seeds=[0], claims=[])
-    (run,) = plan_runs(experiment, data=tiny_folder)
-    about = {name: getattr(run, name) for name in ("method", "environment", "seed", "profile", "root")}
-    job = Job(
-        **about,
-        experiment="small",
-        dataset=str(tiny_folder),
-        folder=str(tmp_path / "run"),
-        identity=run.identity(),
-        config=run.config,
-        device="cpu",
-        protocols=run.protocols,
-        curve_points=run.curve_points,
-    )
+    (job,) = plan_runs(experiment, data=tiny_folder, out=tmp_path)
     run_job(job, lambda event: None)
-    result = read_record(RunResult, tmp_path / "run.json")
+    result = read_result(Path(job.folder))
     assert [(point.step, point.stage) for point in result.curve] == [(20, "model"), (40, "policy")]
 
 

@@ -10,11 +10,10 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import load_experiment, run_experiment, write_report
-from tcmrl_algo.experiment import datasets
-from tcmrl_algo.experiment.config import Experiment, read_experiment
-from tcmrl_algo.experiment.datasets import missing_datasets
-from tcmrl_algo.experiment.planning import plan_runs
+from tcmrl_algo.experiment import plan
+from tcmrl_algo.experiment.plan import missing_datasets, plan_runs
 from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.experiment.spec import Experiment, read_experiment
 from tcmrl_data import SelectionError, TrainingError
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
@@ -68,23 +67,23 @@ def test_a_dataset_of_another_profile_is_used_only_if_it_is_named_itself(
     content["environments"] = {"point-robot": {"profile": "quick", "dataset_profile": "reduced"}}
     experiment = read_experiment(content, place="test")
     with pytest.raises(SelectionError, match=r"profile 'quick', the experiment needs 'reduced'.*--data"):
-        plan_runs(experiment, data=tmp_path)
-    assert len(plan_runs(experiment, data=tiny_folder)) == 4
+        plan_runs(experiment, data=tmp_path, out=tmp_path)
+    assert len(plan_runs(experiment, data=tiny_folder, out=tiny_folder)) == 4
 
 
 def test_only_chosen_environments_are_run(tiny_folder: Path, call: Call) -> None:
     content = experiments.tables(tiny_folder)
     content["environments"]["half-cheetah-vel"] = {"dataset": "nowhere"}
     experiment = read_experiment(content, place="test")
-    runs = plan_runs(experiment, data=tiny_folder.parent, environments=["point-robot"])
+    runs = plan_runs(experiment, data=tiny_folder.parent, out=tiny_folder, environments=["point-robot"])
     assert {run.environment for run in runs} == {"point-robot"}
     with pytest.raises(TrainingError, match=r"'point-robt'.*'half-cheetah-vel'"):
-        plan_runs(experiment, data=tiny_folder.parent, environments=["point-robt"])
+        plan_runs(experiment, data=tiny_folder.parent, out=tiny_folder, environments=["point-robt"])
 
 
 def test_folds_test_every_task_once_with_every_seed(tiny_folder: Path, tmp_path: Path) -> None:
     experiment = _small(tiny_folder, folds=2, seeds=[3])
-    runs = plan_runs(experiment, data=tmp_path, views=tmp_path / "folds")
+    runs = plan_runs(experiment, data=tmp_path, out=tmp_path)
     assert [(run.method, run.seed, run.fold) for run in runs] == [
         ("TCMRL", 3, 0),
         ("no context", 3, 0),
@@ -92,18 +91,16 @@ def test_folds_test_every_task_once_with_every_seed(tiny_folder: Path, tmp_path:
         ("no context", 3, 1),
     ]
     assert len({run.id for run in runs}) == 4
-    assert runs[0].identity() != runs[2].identity()  # folds share the root of their source
+    assert runs[0].identity != runs[2].identity  # folds share the root of their source
     tested = [
         {task.index for task in tcmrl_data.open_dataset(run.dataset).test_tasks} for run in (runs[0], runs[2])
     ]
     assert not tested[0] & tested[1]
     assert tested[0] | tested[1] == {task.index for task in tcmrl_data.open_dataset(tiny_folder).tasks}
-    again = plan_runs(experiment, data=tmp_path, views=tmp_path / "folds")
-    assert [run.identity() for run in again] == [run.identity() for run in runs]
-    with pytest.raises(TrainingError, match="folds"):
-        plan_runs(experiment, data=tmp_path)
+    again = plan_runs(experiment, data=tmp_path, out=tmp_path)
+    assert [run.identity for run in again] == [run.identity for run in runs]
     with pytest.raises(SelectionError, match="5 tasks do not make 6 folds"):
-        plan_runs(_small(tiny_folder, folds=6), data=tmp_path, views=tmp_path / "six")
+        plan_runs(_small(tiny_folder, folds=6), data=tmp_path, out=tmp_path)
 
 
 @pytest.mark.check
@@ -129,7 +126,7 @@ def test_build_makes_what_is_missing_and_then_runs(
     tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By the recipe of the profile, but for fewer steps and episodes."""
-    monkeypatch.setattr(datasets, "load_recipe", functools.partial(tcmrl_data.load_recipe, overrides=TINY))
+    monkeypatch.setattr(plan, "load_recipe", functools.partial(tcmrl_data.load_recipe, overrides=TINY))
     content = experiments.tables(tmp_path / "data", seeds=[0], claims=[])
     content["methods"] = {"A": {"algorithm": "no_context"}}
     file = experiments.write_file(tmp_path / "small.toml", content)
@@ -142,8 +139,8 @@ def test_data_may_be_a_view_file(tiny_folder: Path, tmp_path: Path) -> None:
     view = tmp_path / "half.json"
     tcmrl_data.derive_dataset(tiny_folder, view=view, snapshots="last")
     experiment = _small(tiny_folder, environments={"point-robot": {"profile": "quick"}})
-    planned = plan_runs(experiment, data=view)
-    assert {run.dataset for run in planned} == {view}
+    planned = plan_runs(experiment, data=view, out=tmp_path)
+    assert {run.dataset for run in planned} == {str(view)}
     assert {run.root for run in planned} == {tcmrl_data.open_dataset(view).manifest.root}
     (missing,) = missing_datasets(experiment, tmp_path / "none.json")
     assert missing.folder == tmp_path / "none.json" / "point-robot"

@@ -4,7 +4,7 @@ import pytest
 
 import tcmrl_data
 from tcmrl_algo import experiment_names, load_experiment
-from tcmrl_algo.experiment.planning import resolve_method
+from tcmrl_algo.experiment.plan import resolve_method
 from tcmrl_algo.experiment.results import Tuned
 
 TUNED = Tuned(

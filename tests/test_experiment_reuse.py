@@ -9,9 +9,10 @@ import pytest
 from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import ExperimentReport, add_tunings, run_experiment, tuned_settings
-from tcmrl_algo.experiment.config import Experiment, read_experiment
-from tcmrl_algo.experiment.planning import PlannedRun, plan_runs
-from tcmrl_algo.tuning.record import RECORD, Trial, Tuning
+from tcmrl_algo.experiment.plan import plan_runs
+from tcmrl_algo.experiment.results import Job
+from tcmrl_algo.experiment.spec import Experiment, read_experiment
+from tcmrl_algo.experiment.tunings import RECORD, Trial, Tuning
 from tcmrl_data import CheckpointError, TrainingError
 from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.records import write_record
@@ -153,13 +154,13 @@ def test_what_a_file_sets_goes_over_tuned_settings(tiny_folder: Path, tmp_path: 
     }
     experiment = _experiment(tiny_folder, methods=methods)
     found = tuned_settings(experiment, tmp_path)
-    plans = plan_runs(experiment, data=tmp_path, tuned=found)
+    plans = plan_runs(experiment, data=tmp_path, out=tmp_path, tuned=found)
     assert [_searched(plan) for plan in plans] == [(0.002, 0.7), (0.002, 0.5)]
     assert plans[0].tuned == plans[1].tuned == found["point-robot"]["tcmrl"]
     assert (found["point-robot"]["tcmrl"].trials, found["point-robot"]["tcmrl"].score) == (2, 0.5)
     place = {"dataset": str(tiny_folder), "training": {"optimizer": {"learning_rate": 0.1}}}
     experiment = _experiment(tiny_folder, methods=methods, environments={"point-robot": place})
-    plans = plan_runs(experiment, data=tmp_path, tuned=found)
+    plans = plan_runs(experiment, data=tmp_path, out=tmp_path, tuned=found)
     assert [_searched(plan) for plan in plans] == [(0.1, 0.7), (0.1, 0.5)]
 
 
@@ -180,7 +181,7 @@ def test_a_table_of_tunings_gives_the_settings_of_their_folder(tiny_folder: Path
         tuned_settings(_experiment(tiny_folder, environments=places), table)
 
 
-def _searched(plan: PlannedRun) -> tuple[float, float]:
+def _searched(plan: Job) -> tuple[float, float]:
     return plan.config.settings.optimizer.learning_rate, plan.config.settings.actor_critic.gamma
 
 
@@ -206,6 +207,10 @@ def test_missing_unequal_and_failed_tunings_are_refused(
         tuned_settings(_experiment(tiny_folder, methods=both), tmp_path)
     fixed = {"optimizer": {"learning_rate": 1e-3}, "actor_critic": {"entropy": 0.1}}
     control = {"algorithm": "no_context", "training": fixed}
+    found = tuned_settings(_experiment(tiny_folder, methods=METHODS | {"no context": control}), tmp_path)
+    assert list(found["point-robot"]) == ["tcmrl"]
+    cloned = {"optimizer": fixed["optimizer"], "actor_critic": {"kind": "bc"}}
+    control = control | {"training": cloned}
     found = tuned_settings(_experiment(tiny_folder, methods=METHODS | {"no context": control}), tmp_path)
     assert list(found["point-robot"]) == ["tcmrl"]
     control = control | {"training": {"optimizer": fixed["optimizer"]}}

@@ -16,9 +16,8 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import WrittenReport, open_run, run_experiment, write_report
-from tcmrl_algo.experiment.compact import compact
-from tcmrl_algo.experiment.config import read_experiment
-from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.experiment.results import RunResult, read_result
+from tcmrl_algo.experiment.spec import read_experiment
 from tcmrl_algo.reporting.compose import compose
 from tcmrl_algo.reporting.contexts import (
     Stored,
@@ -29,7 +28,7 @@ from tcmrl_algo.reporting.contexts import (
 )
 from tcmrl_algo.reporting.figures import draw_embeddings
 from tcmrl_algo.reporting.sections import attention_table, final_table, published, published_table
-from tcmrl_algo.reporting.sources import FinishedRun, labels_of, read_sources
+from tcmrl_algo.reporting.sources import labels_of, read_sources
 from tcmrl_algo.reporting.tables import Table, across_seeds
 from tcmrl_algo.reporting.write import measure_paths, page_text
 from tcmrl_data import Dataset
@@ -60,10 +59,10 @@ def report(results: Path, tmp_path_factory: pytest.TempPathFactory) -> WrittenRe
 
 
 @pytest.fixture(scope="module")
-def trained(results: Path) -> FinishedRun:
+def trained(results: Path) -> RunResult:
     """The finished run of TCMRL."""
     folder = results / "runs/point-robot--tcmrl--seed0"
-    return FinishedRun(read_record(RunResult, folder.with_name(f"{folder.name}.json")), folder)
+    return read_result(folder)
 
 
 def test_contexts_within_a_task_over_contexts_between_tasks() -> None:
@@ -100,7 +99,7 @@ def test_methods_may_have_different_numbers_of_contexts(tmp_path: Path) -> None:
 
 
 @pytest.mark.check
-def test_attention_is_relative_and_makes_the_context(trained: FinishedRun, tiny: Dataset) -> None:
+def test_attention_is_relative_and_makes_the_context(trained: RunResult, tiny: Dataset) -> None:
     stored = Stored(tiny, "all")
     assert stored.labels.shape == (len(stored.lanes),)
     found = TrainedContexts(trained, stored)
@@ -109,14 +108,14 @@ def test_attention_is_relative_and_makes_the_context(trained: FinishedRun, tiny:
     assert np.mean(weights.by_step) == pytest.approx(1.0, abs=1e-5)
     assert weights.example.sum() == pytest.approx(len(weights.example), abs=1e-4)
     assert (len(weights.zero), len(weights.nonzero)) == (0, 0)  # no dense reward is zero
-    measured = trained.result.model_copy(update={"contexts": found.measures()})
+    measured = trained.model_copy(update={"contexts": found.measures()})
     assert measured.contexts is not None and measured.contexts.tasks == len(stored.tasks)
     assert attention_table("a", "point-robot", [measured]) is None
     assert found.contexts is not None and found.contexts.shape == (len(stored.lanes), 4)
 
 
 @pytest.mark.check
-def test_weights_of_rewarded_transitions_are_told_apart(trained: FinishedRun, tiny: Dataset) -> None:
+def test_weights_of_rewarded_transitions_are_told_apart(trained: RunResult, tiny: Dataset) -> None:
     stored = Stored(tiny, "all")
     trajectory = stored.trajectories[0][0]
     rewards = np.zeros(len(trajectory), dtype=np.float32)
@@ -129,7 +128,7 @@ def test_weights_of_rewarded_transitions_are_told_apart(trained: FinishedRun, ti
     assert (len(weights.zero), len(weights.nonzero)) == (len(trajectory) - 1, 1)
     total = weights.zero.sum() + weights.nonzero.sum()
     assert total == pytest.approx(len(trajectory), abs=1e-4)
-    measured = trained.result.model_copy(update={"contexts": found.measures()})
+    measured = trained.model_copy(update={"contexts": found.measures()})
     table = attention_table("a", "sparse-point-robot", [measured])
     assert table is not None
     assert [row[1] for row in table.rows] == ["nonzero reward", "zero reward"]
@@ -155,16 +154,16 @@ def test_tables_are_markdown_and_csv() -> None:
     assert list(csv.reader(table.csv().splitlines())) == [["a|b", "c"], ["x|y", "1.23456"], ["", "12345.6"]]
 
 
-def test_the_paper_stands_beside_ours_where_the_unit_is_the_same(trained: FinishedRun) -> None:
-    assert published_table("p", "point-robot", [trained.result]) is None
-    assert published_table("p", "ml1/reach", [trained.result]) is None
-    ours = trained.result.model_copy(update={"method": "a method of ours"})
+def test_the_paper_stands_beside_ours_where_the_unit_is_the_same(trained: RunResult) -> None:
+    assert published_table("p", "point-robot", [trained]) is None
+    assert published_table("p", "ml1/reach", [trained]) is None
+    ours = trained.model_copy(update={"method": "a method of ours"})
     assert published_table("p", "half-cheetah-vel", [ours]) is None
-    table = published_table("p", "half-cheetah-vel", [trained.result])
+    table = published_table("p", "half-cheetah-vel", [trained])
     assert table is not None
     rows = {row[0]: row for row in table.rows}
     assert rows["TCMRL"][1] == "-79.7 ± 11.3"
-    assert rows["TCMRL"][2] == trained.result.evaluations["offline"]["mean_final"]
+    assert rows["TCMRL"][2] == trained.evaluations["offline"]["mean_final"]
     assert rows["IDAQ"][2:] == (None,) * (len(table.columns) - 2)
     known = {row["name"] for row in tcmrl_data.list_environments().environments}
     assert set(published()["returns"]) <= known
@@ -270,20 +269,20 @@ def test_a_report_is_made_again_from_what_stands_beside_it(report: WrittenReport
     assert {file.name for file in written.files} == {file.name for file in report.files}
 
 
-def test_committed_results_are_small_and_name_no_path(report: WrittenReport, trained: FinishedRun) -> None:
+def test_committed_results_are_small_and_name_no_path(report: WrittenReport, trained: RunResult) -> None:
     file = report.report.parent / "runs/point-robot--tcmrl--seed0.json"
     result = read_record(RunResult, file)
     assert file.stat().st_size < 6_000
     assert (result.dataset, result.identity) == ("", {})
-    assert result == compact(result)
+    assert result == result.compact()
     assert result.contexts is not None and result.contexts.context_ratio is not None
     for protocol, evaluation in result.evaluations.items():
-        exact = trained.result.evaluations[protocol]["mean_final"]
+        exact = trained.evaluations[protocol]["mean_final"]
         assert evaluation["mean_final"] == float(f"{exact:.6g}")
         assert "returns" not in evaluation["tasks"][0]
     for path in report.files:
         if path.suffix != ".png":
-            assert trained.result.dataset not in path.read_text()
+            assert trained.dataset not in path.read_text()
 
 
 def test_what_is_no_run_is_refused(results: Path, tmp_path: Path, call: Call) -> None:

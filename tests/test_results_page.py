@@ -13,8 +13,14 @@ from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import write_results_page
 from tcmrl_algo.experiment.aggregate import mean_interval
-from tcmrl_algo.experiment.flat import read_table, write_table
-from tcmrl_algo.experiment.results import ContextMeasures, CurvePoint, RunResult, Tuned
+from tcmrl_algo.experiment.results import (
+    ContextMeasures,
+    CurvePoint,
+    RunResult,
+    Tuned,
+    read_table,
+    write_table,
+)
 from tcmrl_algo.reporting.results_page import PAGE, TEMPLATE, Numbers, number, page_of, read_numbers
 from tcmrl_algo.reporting.returns import DatasetReturns, SnapshotReturns
 from tcmrl_algo.reporting.rows import (

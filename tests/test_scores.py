@@ -3,8 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from tcmrl_algo.experiment.config import run_id
 from tcmrl_algo.experiment.results import RunResult, success_rate
+from tcmrl_algo.experiment.spec import run_id
 from tcmrl_algo.reporting.scores import over_dataset
 from tcmrl_algo.reporting.sections import final_table, published_table
 from tcmrl_algo.reporting.sources import read_sources

@@ -14,7 +14,7 @@ from tcmrl_algo.algorithms.core.context import ContextAlgorithm, ContextLosses
 from tcmrl_algo.algorithms.core.networks import call_frozen
 from tcmrl_algo.algorithms.tcmrl import negative_reward_loss, reverse_context, task_contrastive_loss
 from tcmrl_algo.algorithms.tcmrl_variants import negative_rewards
-from tcmrl_algo.experiment.config import load_experiment
+from tcmrl_algo.experiment.spec import load_experiment
 from tcmrl_data import Batch, Steps
 from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, with_steps
 

@@ -22,12 +22,18 @@ from tcmrl_algo import (
     resolve_for,
     tune_method,
 )
-from tcmrl_algo.experiment.config import override_texts
-from tcmrl_algo.tuning.holding_out import checked_tasks, evenly_spaced, held_out_tasks
-from tcmrl_algo.tuning.plan import plan_tuning
-from tcmrl_algo.tuning.proposals import GENERATION, RANDOM_TRIALS, known_to, propose
-from tcmrl_algo.tuning.record import Trial
-from tcmrl_algo.tuning.space import Dimension, space_on
+from tcmrl_algo.experiment.spec import override_texts
+from tcmrl_algo.experiment.tune import (
+    GENERATION,
+    RANDOM_TRIALS,
+    checked_tasks,
+    evenly_spaced,
+    held_out_tasks,
+    known_to,
+    plan_tuning,
+    propose,
+)
+from tcmrl_algo.experiment.tunings import Dimension, Trial, space_on
 from tcmrl_data import Dataset, SelectionError, TrainingError
 from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.errors import CheckpointError, MissingPackageError
@@ -71,7 +77,7 @@ def tuned(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[
     folder = tmp_path_factory.mktemp("tuned")
     shutil.copytree(tiny_folder, folder / "data")
     dataset = tcmrl_data.open_dataset(without_test_parts(folder / "data"))
-    events = []
+    events: list[tuple[Any, ...]] = []
     report = tune_method(
         dataset,
         folder / "tuning",
@@ -81,9 +87,9 @@ def tuned(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[
         overrides=SETTINGS,
         workers=2,
         engine=InProcessEngine(),
-        report=events.append,
+        report=lambda *event: events.append(event),
     )
-    assert [(event.done, event.total) for event in events] == [(1, 2), (2, 2)]
+    assert [event[1:3] for event in events] == [(1, 2), (2, 2)]
     return folder / "data", report
 
 
@@ -104,11 +110,11 @@ def test_test_tasks_are_neither_trained_on_nor_scored_on_nor_read(tuned: tuple[P
     assert (report.failed, report.present) == ((), 0)
     assert set(tuning.training_tasks) | set(tuning.held_out) == training
     assert not set(tuning.training_tasks) & set(tuning.held_out)
-    run = open_run(report.out / "runs" / "trial0000-seed0")
+    run = open_run(report.out / "runs" / "point-robot--trial-0000--seed0")
     seen = run.open_dataset()
     assert {task.index for task in seen.train_tasks} == set(tuning.training_tasks)
     assert {task.index for task in seen.test_tasks} == set(tuning.held_out)
-    result = json.loads((report.out / "runs" / "trial0000-seed0.json").read_text())
+    result = json.loads((report.out / "runs" / "point-robot--trial-0000--seed0.json").read_text())
     for protocol in ("offline", "paper"):
         assert [row["task"] for row in result["evaluations"][protocol]["tasks"]] == list(tuning.held_out)
 
@@ -122,7 +128,9 @@ def test_a_score_is_the_mean_over_protocols_and_the_best_trial_has_the_highest(
     assert len(tuning.trials) == 2
     for trial in tuning.trials:
         (run,) = trial.runs
-        result = json.loads((report.out / "runs" / f"trial{trial.number:04d}-seed0.json").read_text())
+        result = json.loads(
+            (report.out / "runs" / f"point-robot--trial-{trial.number:04d}--seed0.json").read_text()
+        )
         means = {name: found["mean_normalized"] for name, found in result["evaluations"].items()}
         assert run.normalized == means
         assert list(means) == ["offline", "paper"]
@@ -190,8 +198,8 @@ def test_an_interrupted_tuning_goes_on_and_ends_as_an_uninterrupted_one(
     waiting = second.model_copy(update={"runs": (), "score": None})
     record = report.tuning.with_trials([waiting])
     (out / "tuning.json").write_text(record.model_dump_json())
-    (out / "runs" / "trial0001-seed0.json").unlink()
-    shutil.rmtree(out / "runs" / "trial0001-seed0" / "checkpoints" / "step_000000040")
+    (out / "runs" / "point-robot--trial-0001--seed0.json").unlink()
+    shutil.rmtree(out / "runs" / "point-robot--trial-0001--seed0" / "checkpoints" / "step_000000040")
     code, output, _ = call(*arguments(data, out, trials=2), "--quiet")
     assert code == 0
     assert "1 trials done, 1 already present" in output
@@ -324,7 +332,7 @@ def test_what_is_set_is_not_searched(tiny: Dataset, tmp_path: Path) -> None:
             protocols=["offline"],
             overrides=overrides,
         )
-        return list(plan.tuning.space)
+        return list(plan.space)
 
     own = ["csro.penalty", "csro.distance_weight"]
     rate, entropy = "optimizer.learning_rate", "actor_critic.entropy"
@@ -332,6 +340,8 @@ def test_what_is_set_is_not_searched(tiny: Dataset, tmp_path: Path) -> None:
     assert space("csro", f"{rate}=2e-3", f"{entropy} = 0.3") == own
     assert space("csro", "csro.epsilon=0.2", "csro.penalty=2.0") == [rate, entropy, "csro.distance_weight"]
     assert space("tcmrl", "tcmrl.weights={distance=0.2}") == [rate, entropy]
+    for kind in ("iql", "bc"):  # neither reads the entropy
+        assert space("csro", f"actor_critic.kind={kind}") == [rate, *own]
     both = (f"{rate}=2e-3", f"{entropy}=0.3")
     with pytest.raises(TrainingError, match="nothing is left to search of no_context"):
         tune_method(tiny, tmp_path / "out", algorithm="no_context", trials=1, overrides=both)

@@ -1,15 +1,22 @@
-"""What a run of an experiment leaves: one JSON document, one row of the table per protocol."""
+"""The record of a run: what a worker is told, what a run leaves, and its rows as CSV.
+
+`RunSpec` says which run it is; a `Job` adds what a worker needs to do it, a `RunResult` what came of it.
+"""
 
 import csv
+import dataclasses
 import io
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from types import UnionType
+from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
-from tcmrl_algo.experiment.config import Experiment
+from tcmrl_algo.experiment.spec import Experiment, run_id
 from tcmrl_algo.training.config import TrainingConfig
+from tcmrl_data import CheckpointError
+from tcmrl_data.foundation.disk import make_folders, replace_file
 from tcmrl_data.foundation.records import read_record
 
 COLUMNS = (
@@ -34,6 +41,10 @@ COLUMNS = (
 )
 AGAIN = "; delete it, and the run is done again"
 """What helps against a broken result."""
+DIGITS = 6
+"""Significant digits of a float in a table or a compact result; reports print four."""
+YES = "yes"
+Row = TypeVar("Row")
 
 
 class _Record(BaseModel):
@@ -109,17 +120,91 @@ class ContextMeasures(_Record):
     median_nonzero: float | None = None
 
 
-class RunResult(_Record):
-    """A finished run: where it came from, what it learned, what it took.
+class Curve(_Record):
+    """`curve.json` in a run's folder: the points so far."""
+
+    points: tuple[CurvePoint, ...] = ()
+
+
+class SharedTraining(_Record):
+    """What a run takes over from a finished one of equal training.
 
     Attributes:
-        experiment, method, algorithm, environment, seed, profile: which run this is.
-        privileged: whether the method is a control that sees task parameters.
+        training_of: `experiment, method` of that run.
+        training_seconds, peak_memory: what it took.
+        evaluations: its documents under protocols with equal settings.
+    """
+
+    training_of: str
+    training_seconds: float | None
+    peak_memory: int | None
+    evaluations: dict[str, dict[str, Any]] = {}
+
+
+class RunSpec(_Record):
+    """Which run: a method on a dataset with a seed, and all settings.
+
+    Attributes:
+        experiment, method, environment, seed, profile: which run this is, from whose training table.
         fold: which fold of the tasks is its test split, in an experiment with folds.
-        dataset, root: the dataset and its Merkle root.
-        steps, device, threads: of training; results depend on device and threads in their last bits.
-        identity: everything that the result is a function of, beside the code.
+        dataset, root: the dataset, by an absolute path, and its Merkle root.
+        device: a torch device.
+        identity: everything that the result is a function of, beside code, device and threads.
         config: the resolved training configuration.
+        tuned: where its settings come from, if they were tuned.
+    """
+
+    experiment: str
+    method: str
+    environment: str
+    seed: int
+    fold: int | None = None
+    profile: str
+    dataset: str
+    root: str
+    device: str
+    identity: dict[str, Any]
+    config: TrainingConfig
+    tuned: Tuned | None = None
+
+    @property
+    def id(self) -> str:
+        """Names the run's files in a results folder."""
+        return run_id(self.environment, self.method, self.seed, self.fold)
+
+    @property
+    def pair(self) -> tuple[int, int | None]:
+        """Seed and fold, by which runs of two methods are compared."""
+        return self.seed, self.fold
+
+
+class Job(RunSpec):
+    """A run to do: what its worker is told, and `job.json` in its folder.
+
+    Attributes:
+        folder: the run's, absolute; the result is written beside it.
+        protocols, curve_points: how it is evaluated.
+        shared: what it takes over from an equal training.
+    """
+
+    folder: str
+    protocols: tuple[str, ...]
+    curve_points: int
+    shared: SharedTraining | None = None
+
+    def points(self) -> list[int]:
+        """Steps at which the learning curve is evaluated; the last one is the end of training."""
+        steps = self.config.settings.run.steps
+        return [round(steps * (index + 1) / self.curve_points) for index in range(self.curve_points)]
+
+
+class RunResult(RunSpec):
+    """A finished run: what it learned, and what it took.
+
+    Attributes:
+        folder: of the run, with its checkpoints; it may be gone. Not part of the document.
+        algorithm, privileged: the method in code; whether it is a control that sees task parameters.
+        steps, threads: of training; results depend on threads and device in their last bits.
         versions: of the packages that results depend on.
         digest: sha256 over all tensors, by which two runs compare.
         curve: the learning curve.
@@ -128,7 +213,6 @@ class RunResult(_Record):
             them; None where none was timed.
         evaluation_seconds: of all evaluations.
         peak_memory: bytes, of the process, or of the CUDA device where there is one.
-        tuned: where its settings come from, if they were tuned.
         training_of: `experiment, method` whose training it shares, if it was not trained for this one.
         contexts: what a report measured of its contexts; None before, and without a checkpoint.
         behavior_seed: root seed of the dataset; None where none is known.
@@ -138,21 +222,11 @@ class RunResult(_Record):
     """
 
     schema_version: Literal[1] = 1
-    experiment: str
-    method: str
+    folder: Path | None = Field(default=None, exclude=True)
     algorithm: str
     privileged: bool
-    environment: str
-    seed: int
-    fold: int | None = None
-    profile: str
-    dataset: str
-    root: str
     steps: int
-    device: str
     threads: int
-    identity: dict[str, Any]
-    config: TrainingConfig
     versions: dict[str, str]
     digest: str
     curve: tuple[CurvePoint, ...]
@@ -160,7 +234,6 @@ class RunResult(_Record):
     training_seconds: float | None
     evaluation_seconds: float | None
     peak_memory: int | None
-    tuned: Tuned | None = None
     training_of: str | None = None
     contexts: ContextMeasures | None = None
     behavior_seed: int | None = None
@@ -168,17 +241,12 @@ class RunResult(_Record):
     processor: str | None = None
 
     @property
-    def pair(self) -> tuple[int, int | None]:
-        """Seed and fold, by which runs of two methods are compared."""
-        return self.seed, self.fold
-
-    @property
     def label(self) -> str:
         """Name of the method in tables and figures, which marks a control that observes task parameters."""
         return f"{self.method} (privileged)" if self.privileged else self.method
 
     def rows(self) -> list[dict[str, Any]]:
-        """Rows of the table, one per protocol."""
+        """Rows of `table.csv`, one per protocol."""
         shared = self.model_dump(include=set(COLUMNS))
         return [
             shared
@@ -187,6 +255,37 @@ class RunResult(_Record):
             | {"success": success_rate(evaluation)}
             for protocol, evaluation in self.evaluations.items()
         ]
+
+    def compact(self) -> "RunResult":
+        """The result as it is committed: rounded, without paths and what only continuing needs.
+
+        The dataset is named by its root alone, and lists of single test tasks, such as the returns of
+        adaptation episodes, are dropped. Reports are computed from such results, so that they are the same
+        before and after. The compact form of a compact result is itself.
+        """
+        document = self.model_dump(mode="json")
+        evaluations = {
+            protocol: evaluation
+            | {
+                "tasks": [
+                    {key: value for key, value in task.items() if not isinstance(value, list)}
+                    for task in evaluation["tasks"]
+                ]
+            }
+            for protocol, evaluation in document["evaluations"].items()
+        }
+        numbers = rounded({key: value for key, value in document.items() if key != "config"})
+        changes = {"dataset": "", "identity": {}, "evaluations": rounded(evaluations), "folder": self.folder}
+        return RunResult.model_validate(numbers | changes | {"config": document["config"]})
+
+
+def rounded(value: Any) -> Any:
+    """A JSON value with every float in it rounded to DIGITS significant digits."""
+    if isinstance(value, float):
+        return float(f"{value:.{DIGITS}g}")
+    if isinstance(value, dict):
+        return {key: rounded(item) for key, item in value.items()}
+    return [rounded(item) for item in value] if isinstance(value, list) else value
 
 
 def success_rate(evaluation: Mapping[str, Any]) -> float | None:
@@ -244,14 +343,24 @@ def error_file(folder: Path) -> Path:
     return folder / "error.txt"
 
 
+def read_result(folder: Path) -> RunResult:
+    """The result of the run in a folder.
+
+    Raises:
+        CheckpointError: there is none, or it is not what a run writes.
+    """
+    result = read_record(RunResult, result_file(folder), remedy=AGAIN)
+    return result.model_copy(update={"folder": folder})
+
+
 def read_results(folder: Path, experiment: Experiment) -> list[RunResult]:
     """Every finished run in a results folder, by environment, method (in the file's order), fold and seed.
 
     Raises:
         CheckpointError: a result is not what a run writes.
     """
-    results = [read_record(RunResult, file, remedy=AGAIN) for file in sorted(folder.glob("runs/*.json"))]
     order = list(experiment.methods)
+    results = [read_result(file.with_suffix("")) for file in sorted(folder.glob("runs/*.json"))]
     known = [result for result in results if result.method in order]
 
     def place(result: RunResult) -> tuple[str, int, int, int]:
@@ -263,3 +372,66 @@ def read_results(folder: Path, experiment: Experiment) -> list[RunResult]:
 
 def _count(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def read_table(kind: type[Row], file: Path) -> list[Row]:
+    """The rows of a CSV file as dataclasses; an empty cell is None, or False.
+
+    Raises:
+        CheckpointError: no such file, other columns than the fields of `kind`, or a cell of another type.
+    """
+    try:
+        text = file.read_text(encoding="utf-8")
+    except OSError as error:
+        raise CheckpointError(f"{file}: {error.strerror}") from None
+    reader, parsers = csv.DictReader(io.StringIO(text)), _parsers(kind)
+    if reader.fieldnames != list(parsers):
+        raise CheckpointError(f"{file} has columns {reader.fieldnames}; they must be {list(parsers)}")
+    rows = []
+    for values in reader:
+        try:
+            rows.append(kind(**{column: parse(values[column]) for column, parse in parsers.items()}))
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"{file}, line {reader.line_num}: {error}") from None
+    return rows
+
+
+def write_table(kind: type[Row], file: Path, rows: Iterable[Row]) -> None:
+    """Writes dataclasses as a CSV file, floats with six significant digits."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    columns = list(_parsers(kind))
+    writer.writerow(columns)
+    for row in rows:
+        writer.writerow([_cell(getattr(row, column)) for column in columns])
+    make_folders(file.parent)
+    replace_file(file, stream.getvalue().encode())
+
+
+def merged(old: Iterable[Row], new: Iterable[Row], key: Callable[[Row], Any]) -> list[Row]:
+    """Rows of both, sorted by their keys; a new row takes the place of the old one of its key."""
+    rows = {key(row): row for row in (*old, *new)}
+    return [rows[place] for place in sorted(rows, key=str)]
+
+
+def _parsers(kind: type[Any]) -> dict[str, Callable[[str], Any]]:
+    hints = get_type_hints(kind)
+    return {field.name: _parser(hints[field.name]) for field in dataclasses.fields(kind)}
+
+
+def _parser(hint: Any) -> Callable[[str], Any]:
+    if isinstance(hint, UnionType):
+        (inner,) = (part for part in get_args(hint) if part is not type(None))
+        return lambda text: inner(text) if text else None
+    if hint is bool:
+        return {YES: True, "": False}.__getitem__
+    parse: Callable[[str], Any] = hint
+    return parse
+
+
+def _cell(value: Any) -> str:
+    if value is None or value is False:
+        return ""
+    if value is True:
+        return YES
+    return f"{value:.{DIGITS}g}" if isinstance(value, float) else str(value)

@@ -5,8 +5,8 @@ from dataclasses import dataclass, replace
 from statistics import fmean
 
 from tcmrl_algo.experiment.aggregate import CONFIDENCE, holm, mean_interval, sign_probability
-from tcmrl_algo.experiment.config import Claim, Metric
 from tcmrl_algo.experiment.results import RunResult, coverage
+from tcmrl_algo.experiment.spec import Claim, Metric
 from tcmrl_algo.reporting.fairness import unequal_settings
 from tcmrl_algo.reporting.sources import Source
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import final
 
-from tcmrl_algo.experiment.config import folder_name
 from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.experiment.spec import folder_name
 from tcmrl_algo.reporting import figures, sections
 from tcmrl_algo.reporting.claims import Verdict, judge
 from tcmrl_algo.reporting.contexts import embed

@@ -10,8 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_algo.algorithms.core.context import ContextAlgorithm, attention_of
-from tcmrl_algo.experiment.results import ContextMeasures
-from tcmrl_algo.reporting.sources import FinishedRun
+from tcmrl_algo.experiment.results import ContextMeasures, RunResult
 from tcmrl_algo.training.checkpoint import open_run
 from tcmrl_algo.training.train import create_algorithm
 from tcmrl_data import CheckpointError, Dataset, Task, Trajectory, open_dataset
@@ -82,7 +81,8 @@ class TrainedContexts:
         CheckpointError: the run has no checkpoint, or another dataset.
     """
 
-    def __init__(self, run: FinishedRun, stored: Stored) -> None:
+    def __init__(self, run: RunResult, stored: Stored) -> None:
+        assert run.folder is not None
         opened = open_run(run.folder)
         opened.check_dataset(stored.dataset)
         record = opened.record.model_copy(update={"device": "cpu"})
@@ -186,13 +186,13 @@ class Trained:
         self._stored: dict[tuple[str, str], Stored] = {}
         self._contexts: dict[Path, TrainedContexts] = {}
 
-    def stored(self, run: FinishedRun) -> Stored:
+    def stored(self, run: RunResult) -> Stored:
         """Trajectories of the dataset that a run was trained on.
 
         Raises:
             TcmrlError: the dataset was moved or removed.
         """
-        place, settings = run.result.dataset, run.result.config.settings.run
+        place, settings = run.dataset, run.config.settings.run
         snapshots = settings.context_snapshots or settings.snapshots
         if not Path(place).exists():
             raise CheckpointError(f"{place} does not exist; name the dataset's present folder with --dataset")
@@ -200,12 +200,13 @@ class Trained:
             self._stored[place, snapshots] = Stored(open_dataset(place), snapshots)
         return self._stored[place, snapshots]
 
-    def contexts(self, run: FinishedRun) -> TrainedContexts:
+    def contexts(self, run: RunResult) -> TrainedContexts:
         """Contexts and attention of a run.
 
         Raises:
             TcmrlError: the dataset or the checkpoint of the run was moved or removed.
         """
+        assert run.folder is not None
         if run.folder not in self._contexts:
             self._contexts[run.folder] = TrainedContexts(run, self.stored(run))
         return self._contexts[run.folder]

@@ -3,11 +3,10 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from tcmrl_algo.experiment.compact import compact
 from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.reporting.contexts import FloatArray, IntArray, Trained, TransitionWeights
 from tcmrl_algo.reporting.returns import DatasetReturns, dataset_returns
-from tcmrl_algo.reporting.sources import FinishedRun, Source
+from tcmrl_algo.reporting.sources import Source
 from tcmrl_data import TcmrlError
 
 
@@ -49,35 +48,34 @@ def measure_source(source: Source) -> Measured:
     results: dict[str, list[RunResult]] = {}
     datasets, contexts, unmeasured = dict(source.datasets), {}, {}
     for environment in source.environments():
-        runs = source.of(environment)
+        runs = source.results(environment)
         try:
             results[environment] = [_measured(run, trained) for run in runs]
             contexts[environment] = _contexts(runs, trained)
             datasets[environment] = dataset_returns(trained.stored(runs[0]).dataset)
         except TcmrlError as error:
-            results[environment] = [run.result for run in runs]
+            results[environment] = runs
             if not _has_measures(environment, runs, datasets):
                 unmeasured[environment] = str(error)
-    compacted = iter([compact(result) for found in results.values() for result in found])
-    kept = tuple(replace(run, result=result) for run, result in zip(source.runs, compacted, strict=True))
+    kept = tuple(result.compact() for found in results.values() for result in found)
     return Measured(replace(source, runs=kept, datasets=datasets), contexts, unmeasured)
 
 
-def _measured(run: FinishedRun, trained: Trained) -> RunResult:
-    return run.result.model_copy(update={"contexts": trained.contexts(run).measures()})
+def _measured(run: RunResult, trained: Trained) -> RunResult:
+    return run.model_copy(update={"contexts": trained.contexts(run).measures()})
 
 
 def _has_measures(
-    environment: str, runs: Sequence[FinishedRun], datasets: Mapping[str, DatasetReturns]
+    environment: str, runs: Sequence[RunResult], datasets: Mapping[str, DatasetReturns]
 ) -> bool:
-    return environment in datasets and all(run.result.contexts is not None for run in runs)
+    return environment in datasets and all(run.contexts is not None for run in runs)
 
 
-def _contexts(runs: Sequence[FinishedRun], trained: Trained) -> Contexts:
-    first: dict[str, FinishedRun] = {}
+def _contexts(runs: Sequence[RunResult], trained: Trained) -> Contexts:
+    first: dict[str, RunResult] = {}
     for run in runs:
-        if run.result.fold == runs[0].result.fold:
-            first.setdefault(run.result.label, run)
+        if run.fold == runs[0].fold:
+            first.setdefault(run.label, run)
     found = {method: trained.contexts(run) for method, run in first.items()}
     points = {method: run.contexts for method, run in found.items() if run.contexts is not None}
     return Contexts(

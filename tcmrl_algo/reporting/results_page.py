@@ -14,10 +14,10 @@ from typing import Any
 import jinja2
 
 from tcmrl_algo.experiment.aggregate import holm, mean_interval, sign_probability
-from tcmrl_algo.experiment.flat import Row, read_table
+from tcmrl_algo.experiment.results import Row, read_table
+from tcmrl_algo.experiment.tunings import TABLE, TrialRow
 from tcmrl_algo.reporting.figures import draw_board, draw_method_curves
 from tcmrl_algo.reporting.rows import CURVES, WORTH, CurveRow, RunRow, WorthRow
-from tcmrl_algo.tuning.table import TUNING, TrialRow
 from tcmrl_data import TrainingError
 from tcmrl_data.foundation.disk import make_folders, replace_file
 
@@ -309,7 +309,7 @@ def read_numbers(file: Path) -> Numbers:
     return Numbers(
         read_table(RunRow, file),
         _beside(CurveRow, file, CURVES),
-        _beside(TrialRow, file, TUNING),
+        _beside(TrialRow, file, TABLE),
         _beside(WorthRow, file, WORTH),
     )
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from tcmrl_algo.experiment.compact import rounded
+from tcmrl_algo.experiment.results import rounded
 from tcmrl_data import Dataset, return_table
 
 

@@ -9,14 +9,19 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_algo.algorithms.core.settings import LOGGING_KEYS, TrainingSettings
-from tcmrl_algo.experiment.compact import compact
-from tcmrl_algo.experiment.flat import Row, merged, read_table, write_table
-from tcmrl_algo.experiment.results import ContextMeasures, RunResult, success_rate
+from tcmrl_algo.experiment.results import (
+    ContextMeasures,
+    Row,
+    RunResult,
+    merged,
+    read_table,
+    success_rate,
+    write_table,
+)
+from tcmrl_algo.experiment.tunings import TrialRow, read_tuning, trial_rows
 from tcmrl_algo.reporting.measuring import Measured
 from tcmrl_algo.reporting.returns import DatasetReturns
 from tcmrl_algo.training.config import stage_plan
-from tcmrl_algo.tuning.record import read_tuning
-from tcmrl_algo.tuning.table import TrialRow, trial_rows
 from tcmrl_data import CheckpointError, Worth
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.records import read_record
@@ -181,13 +186,12 @@ def add_rows(file: Path, measured: Iterable[Measured]) -> list[RunRow]:
     curves: list[CurveRow] = []
     for found in measured:
         source = found.source
-        folder = source.runs[0].folder.parents[1]
+        folder = (source.runs[0].folder or Path()).parents[1]
         if not (folder / "experiment.json").is_file():
             raise CheckpointError(
                 "single runs have no experiment; only results folders can be added to a table"
             )
-        for run in source.runs:
-            result = run.result
+        for result in source.runs:
             rows += run_rows(folder.resolve().name, result, source.datasets.get(result.environment))
             curves += curve_rows(folder.resolve().name, result, source.experiment.protocols[0])
     _update(RunRow, file, rows, _run_key)
@@ -226,7 +230,7 @@ def run_rows(experiment: str, result: RunResult, stored: DatasetReturns | None) 
         result: of the run.
         stored: what is known of the dataset.
     """
-    result = compact(result)
+    result = result.compact()
     known = stored if stored is not None and stored.root == result.root else None
     settings, tuned = result.config.settings, result.tuned
     contexts = result.contexts or ContextMeasures(tasks=0)

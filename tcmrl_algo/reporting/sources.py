@@ -9,25 +9,12 @@ from pathlib import Path
 
 from tcmrl_algo.adaptation.evaluate import evaluate_run
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
-from tcmrl_algo.experiment.config import Experiment, experiment_of, folder_name, read_experiment, run_id
 from tcmrl_algo.experiment.results import AGAIN, RunResult, error_file, read_results, result_file
+from tcmrl_algo.experiment.spec import Experiment, experiment_of, folder_name, read_experiment, run_id
 from tcmrl_algo.reporting.returns import DatasetReturns
 from tcmrl_algo.training.checkpoint import Run, open_run, tensors_digest
 from tcmrl_data import CheckpointError, canonical_json, open_dataset
 from tcmrl_data.foundation.records import read_record
-
-
-@dataclass(frozen=True)
-class FinishedRun:
-    """A result, and the folder of its run, which may be removed.
-
-    Attributes:
-        result: the result of the run.
-        folder: folder of the run, with its checkpoints.
-    """
-
-    result: RunResult
-    folder: Path
 
 
 @dataclass(frozen=True)
@@ -42,7 +29,7 @@ class Source:
     """
 
     experiment: Experiment
-    runs: tuple[FinishedRun, ...]
+    runs: tuple[RunResult, ...]
     unfinished: Mapping[str, str | None] = field(default_factory=dict)
     datasets: Mapping[str, DatasetReturns] = field(default_factory=dict)
 
@@ -65,15 +52,11 @@ class Source:
 
     def environments(self) -> list[str]:
         """Environments with finished runs."""
-        return list(dict.fromkeys(run.result.environment for run in self.runs))
-
-    def of(self, environment: str) -> list[FinishedRun]:
-        """Finished runs in an environment."""
-        return [run for run in self.runs if run.result.environment == environment]
+        return list(dict.fromkeys(run.environment for run in self.runs))
 
     def results(self, environment: str) -> list[RunResult]:
-        """Results of the finished runs in an environment."""
-        return [run.result for run in self.of(environment)]
+        """Finished runs in an environment."""
+        return [run for run in self.runs if run.environment == environment]
 
     def stored_return(self, environment: str) -> float | None:
         """Mean return of the stored episodes of the test tasks; None where no report measured it."""
@@ -111,7 +94,7 @@ def read_sources(
             )
     if runs:
         sources.append(_single_runs(runs, report, places))
-    used = {run.result.root for source in sources for run in source.runs}
+    used = {run.root for source in sources for run in source.runs}
     for root, place in places.items():
         if root not in used:
             raise CheckpointError(
@@ -134,13 +117,7 @@ def _relocated(result: RunResult, places: Mapping[str, str]) -> RunResult:
 
 def _results_folder(path: Path, places: Mapping[str, str]) -> Source:
     experiment = experiment_of(path)
-    found = [
-        FinishedRun(
-            _relocated(result, places),
-            path / "runs" / run_id(result.environment, result.method, result.seed, result.fold),
-        )
-        for result in read_results(path, experiment)
-    ]
+    found = [_relocated(result, places) for result in read_results(path, experiment)]
     if not found:
         raise CheckpointError(f"{path} contains no finished run; continue with `tcmrl experiment`")
     records = [
@@ -185,12 +162,12 @@ def _single_runs(
     found = []
     for done, (label, run) in enumerate(zip(labels, runs, strict=True)):
         report("evaluating", done, len(runs))
-        found.append(FinishedRun(_evaluated(label, run, places.get(run.record.root)), run.folder))
+        found.append(_evaluated(label, run, places.get(run.record.root)))
     report("evaluating", len(runs), len(runs))
     order = list(experiment.methods)
 
-    def place_of(run: FinishedRun) -> tuple[str, int, int]:
-        return run.result.environment, order.index(run.result.method), run.result.seed
+    def place_of(run: RunResult) -> tuple[str, int, int]:
+        return run.environment, order.index(run.method), run.seed
 
     return Source(experiment, tuple(sorted(found, key=place_of)))
 
@@ -223,6 +200,7 @@ def _evaluated(label: str, run: Run, place: str | None) -> RunResult:
         for name in PROTOCOLS.working()
     }
     return RunResult(
+        folder=run.folder,
         experiment="runs",
         method=label,
         algorithm=record.config.settings.run.algorithm,

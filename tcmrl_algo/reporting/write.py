@@ -5,9 +5,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_algo.experiment.compact import write_compact
-from tcmrl_algo.experiment.config import folder_name, run_id
-from tcmrl_algo.experiment.results import error_file
+from tcmrl_algo.experiment.results import error_file, result_file
+from tcmrl_algo.experiment.spec import folder_name
 from tcmrl_algo.reporting.claims import Verdict
 from tcmrl_algo.reporting.compose import Block, Page, Picture, compose
 from tcmrl_algo.reporting.html import page_html
@@ -129,10 +128,10 @@ def _write_records(folder: Path, found: Measured) -> list[Path]:
     make_folders(folder)
     source, files = found.source, [folder / "experiment.json"]
     write_record(files[0], source.experiment.without_places())
-    for run in source.runs:
-        result = run.result
-        name = run_id(result.environment, result.method, result.seed, result.fold)
-        files.append(write_compact(folder, name, result))
+    for result in source.runs:
+        files.append(result_file(folder / "runs" / result.id))
+        make_folders(files[-1].parent)
+        replace_file(files[-1], f"{result.model_dump_json()}\n".encode())  # in the order of its protocols
     for environment, returns in source.datasets.items():
         files.append(folder / "datasets" / f"{folder_name(environment)}.json")
         make_folders(files[-1].parent)

@@ -208,6 +208,14 @@ class ActorCriticSettings(BaseModel):
     iql: IqlSettings = IqlSettings()
 
 
+UNREAD = {
+    "sac": ("iql",),
+    "iql": ("entropy", "mean_regularization", "std_regularization", "log_std_range", "cloning", "brac"),
+    "bc": tuple(name for name in ActorCriticSettings.model_fields if name not in ("kind", "hidden")),
+}
+"""Settings of an actor-critic that a kind of it does not read, by kind."""
+
+
 class TrainingSettings(BaseModel):
     """What all methods share."""
 
