@@ -115,6 +115,8 @@ def check(words: tuple[str, ...]) -> None:
         files = [*modules, *(word.partition("::")[0] for word in rest if word.endswith(".py"))]
         missing = {file for file in files if not (ROOT / file).is_file()}
         assert not missing, missing
+    elif program == "source":
+        assert rest == [".venv/bin/activate"], rest  # which `make demo` made
     else:
         assert Path(program).name in ("pip",), program
 
