@@ -25,8 +25,8 @@ from tcmrl_data.foundation.records import Record, _with_tuples
 from tcmrl_data.sampling.rows import READERS, ROW_ARRAYS, Table, fill_rows
 from tcmrl_data.store.arrays import ARRAYS, _ArrayMetadata, _decode_chunk, chunk_problem
 from tcmrl_data.store.arrays import ArrayLayout as Layout
-from tcmrl_data.store.keys import SHA256
 from tcmrl_data.store.part import RECORD, PartRecord
+from tcmrl_data.store.tables import SHA256
 
 _FILE_NAME = re.compile(
     r"policy\.(json|safetensors)|zarr\.json|[a-z0-9_]{1,64}/(zarr\.json|c(/[0-9]{1,9}){1,2})"

@@ -8,20 +8,18 @@ import tcmrl_data
 from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Environment, Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.foundation.records import sealed
 from tcmrl_data.parts.making import Published, make_part
 from tcmrl_data.parts.operation import WantedPart
-from tcmrl_data.recipe.tasks import choose_tasks
-from tcmrl_data.store.keys import PartKey, part_file, part_folder
+from tcmrl_data.recipe.recipe import choose_tasks
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tcmrl_data.store.part import PartRecord, References
 from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartEntry, PartTable, part_line
-from tcmrl_data.store.tables import TableWriter
+from tcmrl_data.store.tables import PartKey, TableWriter, part_file, part_folder
 
 STEPS = 10_000
 """Environment steps between two snapshots."""

@@ -14,7 +14,7 @@ import tcmrl_data
 from tcmrl_data.building.ledger import SEAL_SECONDS, SEAL_SHARE, Ledger
 from tcmrl_data.foundation.disk import make_folders
 from tcmrl_data.parts.making import Published
-from tcmrl_data.store.keys import part_file
+from tcmrl_data.store.tables import part_file
 
 SNAPSHOTS = 100
 NEW_TASKS = 2

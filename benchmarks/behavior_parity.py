@@ -24,13 +24,12 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data import Recipe, load_recipe
-from tcmrl_data.behavior.base import BehaviorContext
-from tcmrl_data.behavior.checkpoints import CheckpointFolder
+from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder
 from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.parts.operation import Simulator
 from tcmrl_data.parts.rollouts import act
-from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.recipe.recipe import choose_tasks
 
 CHECKPOINTS = 5
 RESAMPLES = 10_000

@@ -20,9 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data import Recipe, load_recipe
-from tcmrl_data.behavior.base import BehaviorContext
-from tcmrl_data.behavior.checkpoints import CheckpointFolder
-from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder
+from tcmrl_data.recipe.recipe import choose_tasks
 
 SETTINGS = [
     ("point-robot-wind", 64, 128),

@@ -21,15 +21,14 @@ import numpy as np
 
 import tcmrl_data
 from tcmrl_data import Dataset, Trajectory, open_dataset
-from tcmrl_data.envs.tasks import draw_tasks
+from tcmrl_data.envs.base import draw_tasks
 from tcmrl_data.foundation.disk import write_file
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
-from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import Run, write_dataset
-from tcmrl_data.store.part import DATA_VERSION, References
+from tcmrl_data.store.part import DATA_VERSION, UNKNOWN, References
 from tcmrl_data.store.part_table import PartTable, part_entry
-from tcmrl_data.store.platform import UNKNOWN
+from tcmrl_data.store.tables import MAIN_RUN, PartKey, part_file
 
 STEPS = tuple(range(0, 1_000, 100))
 

@@ -20,7 +20,7 @@ from tcmrl_data.building.unit import UnitSpec, run_unit
 from tcmrl_data.foundation import canonical
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import Disk, make_folders
-from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.recipe.recipe import choose_tasks
 
 
 class Stopwatch:

@@ -41,7 +41,7 @@ import tcmrl_data
 from tcmrl_data import Trajectories, Transitions, Windows
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import ARRAYS
-from tcmrl_data.store.keys import PARTS
+from tcmrl_data.store.tables import PARTS
 
 SIZES = {"half-cheetah-vel": (20, 10, 50), "ml1/reach": (20, 4, 50)}
 """Tasks, snapshots per task, episodes per snapshot: 2 million steps."""

@@ -34,8 +34,8 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.parts.making import Published
 from tcmrl_data.sampling.rows import read_rows
 from tcmrl_data.store.archive import pack_archive
-from tcmrl_data.store.keys import part_file
-from tcmrl_data.store.platform import this_platform
+from tcmrl_data.store.part import this_platform
+from tcmrl_data.store.tables import part_file
 
 SIZES = {"small": (20, 10, 1), "large": (10, 4, 115)}
 """Tasks, snapshots and episodes of half-cheetah-vel in the datasets of real parts."""

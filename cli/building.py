@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from tcmrl_data.foundation.machine import size
-from tcmrl_data.recipe.profile import PROFILES, Profile
+from tcmrl_data.recipe import PROFILES, Profile
 
 from .frame import (
     duration,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tcmrl_data.recipe.profile import PROFILES, Profile
+from tcmrl_data.recipe import PROFILES, Profile
 
 from .building import show_build
 from .frame import (

@@ -70,10 +70,11 @@ def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recomp
       tcmrl-data inspect returns data/point-robot --recompute --json
     """
     import tcmrl_data
-    from tcmrl_data.dataset.returns import first_disagreement, plot_returns, summarize_returns
+    from tcmrl_data.dataset.listing import first_disagreement, summarize_returns
+    from tcmrl_data.quality.scores import plot_returns
 
     opened = tcmrl_data.open_dataset(dataset)
-    table = tcmrl_data.return_table(opened, recompute=recompute)
+    table = tcmrl_data.list_returns(opened, recompute=recompute)
     if plot is not None:
         plot_returns(opened, table, plot)
         remark(f"learning curves written to {plot}", quiet=quiet)
@@ -82,7 +83,7 @@ def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recomp
     else:
         _print_returns(table["name"], summarize_returns(table))
     if recompute:
-        difference = first_disagreement(tcmrl_data.return_table(opened), table)
+        difference = first_disagreement(tcmrl_data.list_returns(opened), table)
         if difference is not None:
             fail_incomplete(f"{opened.folder}: {difference}; run `tcmrl-data repair {opened.folder} --deep`")
 
@@ -122,9 +123,9 @@ def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
       tcmrl-data inspect tasks data/point-robot
     """
     import tcmrl_data
-    from tcmrl_data.dataset.returns import task_table
+    from tcmrl_data.dataset.listing import list_tasks
 
-    document = task_table(tcmrl_data.open_dataset(dataset))
+    document = list_tasks(tcmrl_data.open_dataset(dataset))
     if as_json:
         print_json(document)
         return
@@ -175,9 +176,9 @@ def snapshots(dataset: Path, as_json: bool, quiet: bool) -> None:
       tcmrl-data inspect snapshots data/point-robot
     """
     import tcmrl_data
-    from tcmrl_data.dataset.returns import snapshot_table
+    from tcmrl_data.dataset.listing import list_snapshots
 
-    document = snapshot_table(tcmrl_data.open_dataset(dataset))
+    document = list_snapshots(tcmrl_data.open_dataset(dataset))
     if as_json:
         print_json(document)
         return
@@ -201,9 +202,9 @@ def episodes(dataset: Path, as_json: bool, quiet: bool, task: int | None, step: 
       tcmrl-data inspect episodes data/point-robot --task 7 --step 3000
     """
     import tcmrl_data
-    from tcmrl_data.dataset.returns import episode_table
+    from tcmrl_data.dataset.listing import list_episodes
 
-    document = episode_table(tcmrl_data.open_dataset(dataset), task=task, step=step)
+    document = list_episodes(tcmrl_data.open_dataset(dataset), task=task, step=step)
     if as_json:
         print_json(document)
         return

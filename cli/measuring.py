@@ -59,7 +59,7 @@ def run_measure(
         show: prints a table.
         draw: draws a picture to a file.
     """
-    from tcmrl_data.dataset.picture import check_picture
+    from tcmrl_data.quality.measured import check_picture
 
     if options.plot is not None:
         check_picture(options.plot)

@@ -2,7 +2,7 @@
 
 import click
 
-from tcmrl_data.recipe.profile import PROFILES
+from tcmrl_data.recipe import PROFILES
 
 from .places import complete_training_keys
 

@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.recipe.profile import Profile
+from tcmrl_data.recipe import Profile
 
 from .building import profile_option, recipe_argument, set_option
 from .frame import FOLDED_WIDTH, make_table, output_options, print_json, print_table

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcmrl_data.recipe.profile import Profile
+from tcmrl_data.recipe import Profile
 
 from .completion import completion
 from .controls import controls

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from tcmrl_data.recipe.profile import Profile
+from tcmrl_data.recipe import Profile
 
 from .experiments import NUM_SEEDS
 from .frame import (

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tcmrl_algo import Algorithm, Arena, Capabilities, Metrics
 from tcmrl_algo.algorithms.core.settings import RunSettings
-from tcmrl_data import Batch, Controller, Dataset, Recorder, Task, Trajectory, Transition
+from tcmrl_data import Batch, Controller, Dataset, LaneTransition, Recorder, Task, Trajectory
 
 ANGLES = np.linspace(0.0, np.pi, 100)
 GOALS = np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=-1)
@@ -77,7 +77,7 @@ class SeekingController(GoalController):
         super().__init__(goals)
         self._recorder = Recorder()
 
-    def observe(self, transition: Transition) -> None:
+    def observe(self, transition: LaneTransition) -> None:
         self._recorder.record(transition)
         self._goals = np.array([goal_of(episode) for episode in self._recorder.trajectories()])
 

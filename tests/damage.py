@@ -5,7 +5,7 @@ from pathlib import Path
 from tcmrl_data import open_dataset, verify_dataset
 from tcmrl_data.building.events import EVENTS
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 
 def rot(file: Path) -> None:

@@ -8,11 +8,9 @@ import gymnasium
 import numpy as np
 
 from tcmrl_data import load_recipe
-from tcmrl_data.envs.base import Environment, Parameters
-from tcmrl_data.envs.controller import Controller
+from tcmrl_data.envs.base import Environment, Parameters, draw_tasks
+from tcmrl_data.envs.controller import Controller, Trajectory
 from tcmrl_data.envs.rollout import roll_out
-from tcmrl_data.envs.tasks import draw_tasks
-from tcmrl_data.envs.trajectory import Trajectory
 
 ML1_IN_FULL = ("ml1/reach", "ml1/door-close", "ml1/stick-pull")
 MOST_MEMBERS = 3

@@ -9,16 +9,14 @@ import numpy as np
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, Trajectory, open_dataset
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.envs.base import DENSE_REWARDS
-from tcmrl_data.envs.tasks import Task, draw_tasks
+from tcmrl_data.envs.base import DENSE_REWARDS, Task, draw_tasks
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
-from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import Run, write_dataset
-from tcmrl_data.store.part import DATA_VERSION, References
+from tcmrl_data.store.part import DATA_VERSION, UNKNOWN, References
 from tcmrl_data.store.part_table import PartTable, part_entry
-from tcmrl_data.store.platform import UNKNOWN
+from tcmrl_data.store.tables import MAIN_RUN, PartKey, part_file
 
 EPISODES, HORIZON = 4, 5
 SCORES: Mapping[int, float] = {0: 0.0, 100: 20.0, 200: 40.0, 300: 90.0, 400: 80.0}

@@ -22,8 +22,8 @@ from pathlib import Path
 
 from tcmrl_data import Dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.disk import STAGING, lock_file, remove_abandoned
-from tcmrl_data.store.keys import PARTS
 from tcmrl_data.store.manifest import MANIFEST
+from tcmrl_data.store.tables import PARTS
 from tests.workers import MARK, marked_pids
 
 ORPHAN_SECONDS = 60.0

@@ -19,7 +19,7 @@ from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import STAGING, Disk, replace_file
 from tcmrl_data.parts.making import read_published
 from tcmrl_data.store import tables
-from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.store.tables import PartKey, part_file
 
 Fault = Literal["kill", "torn", "full", "broken", "once"]
 FAULTS: tuple[Fault, ...] = ("kill", "torn", "full", "broken", "once")

@@ -11,7 +11,7 @@ from tcmrl_data import Dataset, Recipe
 from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.errors import RecipeError
 from tcmrl_data.foundation.records import sealed
-from tcmrl_data.recipe.about import (
+from tcmrl_data.recipe.document import (
     About,
     Reference,
     joined_licences,

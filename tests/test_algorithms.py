@@ -18,7 +18,7 @@ from tcmrl_algo.algorithms.core.method import METHODS, Algorithm, Method
 from tcmrl_algo.algorithms.core.problem import Problem, StagePlan
 from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_algo.training.config import stage_plan
-from tcmrl_data import Batch, Controller, Steps, Trajectory, Transition, UniformController
+from tcmrl_data import Batch, Controller, LaneTransition, Steps, Trajectory, UniformController
 from tests.commands import in_process
 from tests.made_up import ACTION_DIM, OBSERVATION_DIM, TASKS, batch, batch_for, problem, settings, trajectory
 
@@ -214,14 +214,14 @@ def test_steps_change_how_a_controller_acts_only_where_it_is_stateful(name: str)
     assert np.array_equal(after[0], before[0]) is not made.method.capabilities.stateful
 
 
-def observed(*, active: tuple[bool, ...]) -> Transition:
+def observed(*, active: tuple[bool, ...]) -> LaneTransition:
     """One step of several lanes."""
     random, lanes = np.random.default_rng(0), len(active)
     states = random.normal(size=(2, lanes, OBSERVATION_DIM)).astype(np.float32)
     ended = np.zeros(lanes, dtype=bool)
     actions = random.uniform(-1, 1, (lanes, ACTION_DIM)).astype(np.float32)
     rewards = random.normal(size=lanes).astype(np.float32)
-    return Transition(states[0], actions, rewards, states[1], ended, ended, np.array(active))
+    return LaneTransition(states[0], actions, rewards, states[1], ended, ended, np.array(active))
 
 
 @every

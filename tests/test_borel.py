@@ -26,10 +26,10 @@ from tcmrl_algo.algorithms.core.problem import StagePlan, pad_trajectories
 from tcmrl_data import (
     Batch,
     Dataset,
+    LaneTransition,
     TrainingError,
     Trajectories,
     Trajectory,
-    Transition,
     UniformController,
 )
 from tests.context_learners import gradients, losses_of
@@ -168,11 +168,11 @@ def test_a_controller_follows_its_episode_from_the_belief_after_the_one_before()
     assert not np.allclose(prior, after.act(STATES[:1], NOISE))
 
 
-def transition(episode: Trajectory, t: int) -> Transition:
+def transition(episode: Trajectory, t: int) -> LaneTransition:
     """Step t of an episode in a single lane."""
     row = slice(t, t + 1)
     ended = np.zeros(1, dtype=bool)
-    return Transition(
+    return LaneTransition(
         episode.observations[row],
         episode.actions[row],
         episode.rewards[row],

@@ -28,18 +28,18 @@ from tcmrl_data.building.plan import plan_build
 from tcmrl_data.building.unit import UnitSpec, run_unit
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.envs.base import LaneStep
+from tcmrl_data.envs.controller import BoolArray, FloatArray
 from tcmrl_data.envs.point_robot import PointRobotLanes
-from tcmrl_data.envs.trajectory import BoolArray, FloatArray
 from tcmrl_data.foundation.disk import LOCK, lock_file
 from tcmrl_data.foundation.errors import BuildError, LockedError, ManifestError, StoreError
-from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.recipe.recipe import choose_tasks
 from tcmrl_data.store import archive as archive_module
 from tcmrl_data.store.archive import Archive, pack_archive
-from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part import PART_SCHEMA, RECORD
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.tables import TASKS as TASKS_TABLE
+from tcmrl_data.store.tables import PartKey, part_file
 from tests.conftest import TASKS, TINY
 
 pytestmark = pytest.mark.usefixtures("module_in_process")

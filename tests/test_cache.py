@@ -36,10 +36,9 @@ from tcmrl_data.sampling.rows import Indices, PartRows, Table, fill_table, read_
 from tcmrl_data.sampling.sampler import load_rows
 from tcmrl_data.store.archive import pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays
-from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, parse_parts, part_line
-from tcmrl_data.store.tables import seal_of
+from tcmrl_data.store.tables import PartKey, seal_of
 from tests.commands import Call, in_process
 
 REQUEST = BatchRequest(

@@ -66,7 +66,7 @@ def test_the_card_says_what_the_dataset_is(call: Call, tiny: Dataset) -> None:
 
 def test_returns_tiers_and_quality_are_those_of_the_inspections(tiny: Dataset) -> None:
     card = dataset_card(tiny)
-    found = tcmrl_data.return_table(tiny)["tasks"]
+    found = tcmrl_data.list_returns(tiny)["tasks"]
     means = [part["mean"] for task in found if task["split"] == "test" for part in task["snapshots"]]
     stages = [stage for stage in measure_quality(tiny).stages if stage.split == "test"]
     rows = [line for line in card.splitlines() if "| test | 1 |" in line]

@@ -15,7 +15,7 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import Recipe, load_recipe
-from tcmrl_data.behavior.checkpoints import CheckpointFolder, TrainingState
+from tcmrl_data.behavior.base import CheckpointFolder, TrainingState
 from tcmrl_data.building.events import EVENTS, BuildEvent
 from tcmrl_data.building.plan import plan_build
 from tcmrl_data.building.unit import UnitSpec, run_unit
@@ -189,7 +189,7 @@ def test_the_warning_of_a_unit_reaches_the_record_and_the_user(tiny_recipe: Reci
 SAVE_OR_LOAD = """
 import json, sys
 import numpy as np
-from tcmrl_data.behavior.checkpoints import TrainingState
+from tcmrl_data.behavior.base import TrainingState
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.unit import UnitSpec, _checkpoints
 spec = UnitSpec.from_json(json.loads(sys.argv[2]))

@@ -9,7 +9,7 @@ from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, Manifest
 from tcmrl_data.describe.cite import citation_text
-from tcmrl_data.recipe.about import About, Reference, is_listed
+from tcmrl_data.recipe.document import About, Reference, is_listed
 from tests.commands import in_process
 from tests.workers import ROOT
 

@@ -12,7 +12,7 @@ from tcmrl_data import Dataset, SelectionError, Trajectory, measure_coverage, me
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.quality.coverage import Grid
 from tcmrl_data.quality.measured import PartSteps, read_steps
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 from tests.commands import Call, in_process
 from tests.graded import graded_dataset, made_dataset
 

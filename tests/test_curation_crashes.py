@@ -22,8 +22,8 @@ from tcmrl_data.engine.base import ENGINES, Unit
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import STAGING, remove_abandoned
 from tcmrl_data.store import tables
-from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import MANIFEST
+from tcmrl_data.store.tables import PartKey
 from tests.graded import graded_dataset
 from tests.simulated_disk import (
     FAULTS,

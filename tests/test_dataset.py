@@ -12,12 +12,11 @@ from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TaskError
 from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store.archive import Archive, pack_archive
-from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part import RECORD
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.tables import TASKS as TASKS_TABLE
-from tcmrl_data.store.tables import seal_of
+from tcmrl_data.store.tables import PartKey, part_file, seal_of
 from tcmrl_data.verification.tables import write_tables
 from tests.conftest import TASKS
 

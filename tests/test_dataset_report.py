@@ -16,7 +16,7 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import Dataset
-from tcmrl_data.dataset.returns import episode_table
+from tcmrl_data.dataset.listing import list_episodes
 from tcmrl_data.describe import measures
 from tcmrl_data.describe.measures import ACTION_BINS, SATURATED, Content, choose_plane, measure
 from tcmrl_data.describe.render import Strips, film_strips
@@ -24,7 +24,7 @@ from tcmrl_data.describe.report import report_html
 from tcmrl_data.foundation.errors import RenderingError
 from tcmrl_data.page.page import cell_text
 from tcmrl_data.quality.worth import context_worth
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 from tests.commands import assert_refused, in_process
 
 pytest.importorskip("plotly", reason="plotly is not installed: pip install 'tcmrl[report]'")
@@ -83,7 +83,7 @@ def test_curves_are_the_numbers_of_inspect(page: str, tiny: Dataset) -> None:
             [found["step"] for found in task["snapshots"]],
             [found["mean"] for found in task["snapshots"]],
         ]
-        for task in tcmrl_data.return_table(tiny)["tasks"]
+        for task in tcmrl_data.list_returns(tiny)["tasks"]
     }
 
 
@@ -163,7 +163,7 @@ def test_actions_and_endings_are_those_of_the_episodes(content: Content, tiny: D
     ]
     assert np.abs(content.actions.counts[last] - expected).sum() <= 8
     assert content.actions.saturated_share(last) == (np.abs(own) >= SATURATED).mean()
-    rows = [row for row in episode_table(tiny)["episodes"] if row["step"] == last]
+    rows = [row for row in list_episodes(tiny)["episodes"] if row["step"] == last]
     found = content.endings.by_step[last]
     assert (found.episodes, found.steps) == (len(rows), sum(row["length"] for row in rows))
     assert (found.terminated, found.truncated) == (0, len(rows))

@@ -10,9 +10,9 @@ from tcmrl_data import Dataset, derive_dataset, merge_datasets, open_dataset, sp
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
-from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import write_dataset
 from tcmrl_data.store.part_table import PartTable, part_entry
+from tcmrl_data.store.tables import PartKey, part_file
 from tests.commands import in_process
 from tests.graded import graded_dataset
 

@@ -12,12 +12,12 @@ from tcmrl_cli.data import data
 import tcmrl_data
 from tcmrl_data import Dataset, derive_dataset, diff_datasets, extend_dataset, open_dataset
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 from tests.commands import assert_refused, in_process
 
 pytestmark = pytest.mark.usefixtures("module_in_process")

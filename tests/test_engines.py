@@ -25,9 +25,9 @@ from tcmrl_data.engine.local import InProcessEngine, LocalEngine
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import BuildError
-from tcmrl_data.recipe.tasks import choose_tasks
-from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.recipe.recipe import choose_tasks
 from tcmrl_data.store.manifest import read_manifest
+from tcmrl_data.store.tables import PartKey, part_file
 from tests.conftest import TASKS, TINY
 from tests.datasets import part_ids
 from tests.directed import Directions

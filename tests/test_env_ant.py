@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tcmrl_data.envs.tasks import draw_tasks
+from tcmrl_data.envs.base import draw_tasks
 from tests.environments import Still, actions_of, environment_of, episodes, parameters_of
 
 

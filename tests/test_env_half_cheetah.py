@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from tcmrl_data import load_recipe
-from tcmrl_data.envs.base import make_environment
-from tcmrl_data.envs.tasks import draw_tasks
+from tcmrl_data.envs.base import draw_tasks, make_environment
 from tests.environments import Still, actions_of, environment_of, episodes, parameters_of
 
 

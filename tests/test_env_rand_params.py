@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tcmrl_data.envs.base import draw_tasks
 from tcmrl_data.envs.controller import UniformController
-from tcmrl_data.envs.tasks import draw_tasks
 from tcmrl_data.foundation.errors import TaskError
 from tests.environments import actions_of, environment_of, episodes, parameters_of
 

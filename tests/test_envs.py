@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from tcmrl_data.envs.base import ENVIRONMENTS
+from tcmrl_data.envs.base import ENVIRONMENTS, draw_tasks
 from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.envs.simulation import SimulatedTask
-from tcmrl_data.envs.tasks import draw_tasks
 from tests.environments import actions_of, environment_of, episodes, parameters_of, play, some_members
 
 NAMES = [name for family in ENVIRONMENTS.working().values() for name in some_members(family)]

@@ -15,8 +15,8 @@ from tcmrl_cli.data import data
 import tcmrl_data
 from tcmrl_data import Dataset, extend_dataset, open_dataset, verify_dataset
 from tcmrl_data.foundation.errors import BuildError, NondeterminismError, SelectionError
-from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.platform import _machine
+from tcmrl_data.store.part import _machine
+from tcmrl_data.store.tables import PartKey
 from tests.commands import assert_refused, in_process
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
@@ -164,7 +164,7 @@ def test_nothing_is_written_where_the_extension_cannot_be_made(
         with pytest.raises(error, match=text):
             extend_dataset(folder, **({"episodes": 3, "out": out} | wrong))  # type: ignore[arg-type]
     elsewhere = {**_machine(), "cpu": "another one"}
-    monkeypatch.setattr("tcmrl_data.store.platform._machine", lambda: elsewhere)
+    monkeypatch.setattr("tcmrl_data.store.part._machine", lambda: elsewhere)
     with pytest.raises(NondeterminismError, match="another one here"):
         extend_dataset(folder, episodes=3, run="elsewhere")
     assert extend_dataset(folder, episodes=3, run="elsewhere", allow_drift=True, dry_run=True).made == 5

@@ -26,7 +26,7 @@ from tcmrl_data import (
     open_sampler,
     verify_dataset,
 )
-from tcmrl_data.envs.tasks import draw_tasks
+from tcmrl_data.envs.base import draw_tasks
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 from tests.sampling import numbered_tasks, sampler_of
 

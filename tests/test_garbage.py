@@ -15,8 +15,8 @@ from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
 from tcmrl_data.foundation.errors import (
     LockedError,
 )
-from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST
+from tcmrl_data.store.tables import PartKey, part_file
 from tcmrl_data.verification.cleaning import collect_garbage
 from tests.damage import littered
 

@@ -13,14 +13,13 @@ import pytest
 import tcmrl_data
 from tcmrl_data import BuildEvent, Dataset, Recipe, load_recipe, open_dataset, repair_dataset, verify_dataset
 from tcmrl_data.building import ledger
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import BuildError, ManifestError, TaskError
 from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store import keys, manifest, tables
-from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import parse_tasks, task_line
+from tcmrl_data.store.tables import PartKey, parse_tasks, part_file, task_line
 from tests.conftest import TINY
 from tests.simulated_disk import PreparedParts, at_last_part
 

@@ -22,10 +22,9 @@ from tcmrl_data import (
 from tcmrl_data.building.events import EVENTS, BuildEvent
 from tcmrl_data.foundation.disk import LOCK, lock_file, lock_holder, make_own, replace_file
 from tcmrl_data.foundation.errors import LockedError
-from tcmrl_data.store.keys import PARTS, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import TASKS
+from tcmrl_data.store.tables import PARTS, TASKS, PartKey, part_file
 from tests.damage import ids_of, rot
 from tests.disks import read_only, run_mounted
 from tests.simulated_disk import PreparedParts

@@ -9,7 +9,7 @@ from tcmrl_cli.data import data
 
 from benchmarks._generated import plan_many, write_many
 from tcmrl_data import open_dataset
-from tcmrl_data.store.keys import MAX_PARTS, MAX_TASKS, PartKey
+from tcmrl_data.store.tables import MAX_PARTS, MAX_TASKS, PartKey
 from tests.commands import in_process
 
 

@@ -9,7 +9,7 @@ from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, derive_dataset, merge_datasets, open_dataset, split_dataset, verify_dataset
 from tcmrl_data.foundation.errors import SelectionError, StoreError
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 from tests.commands import assert_refused, in_process
 from tests.graded import graded_dataset, graded_recipe
 

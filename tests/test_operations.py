@@ -14,8 +14,8 @@ from tcmrl_data.parts.making import OWN_OPERATIONS, make_from, operation_named, 
 from tcmrl_data.parts.operation import OPERATIONS, Operation, Simulator, Sources, StoredPart, WantedPart
 from tcmrl_data.parts.stored import Import
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part import read_part_record
+from tcmrl_data.store.tables import PartKey
 from tcmrl_data.verification.replay import replay_part
 
 KINDS = sorted({**OWN_OPERATIONS, **OPERATIONS.working()}.items())

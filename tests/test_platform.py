@@ -9,14 +9,14 @@ from typing import Any
 import pytest
 
 from tcmrl_data.foundation.canonical import canonical_json
-from tcmrl_data.store.platform import Platform, this_platform
+from tcmrl_data.store.part import Platform, this_platform
 from tests.environments import environment_of
 from tests.platforms import AVX2, BASELINE
 
 SHOW = """
 import json
 from tcmrl_data import load_recipe
-from tcmrl_data.store.platform import this_platform
+from tcmrl_data.store.part import this_platform
 found = this_platform(load_recipe("hopper-rand-params").make_environment(), "stacked")
 print(json.dumps(found.model_dump(mode="json")))
 """

@@ -12,7 +12,7 @@ from tcmrl_data import list_environments, load_recipe
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import PluginError, UnknownNameError
 from tcmrl_data.foundation.plugins import Registry
-from tcmrl_data.store.platform import this_platform
+from tcmrl_data.store.part import this_platform
 from tests.commands import assert_refused, in_process
 from tests.plugin_packages import install
 

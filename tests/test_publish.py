@@ -16,9 +16,9 @@ from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation.disk import LOCK, STAGING, lock_file, lock_holder, publish_folder, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, LockedError, StorageError
 from tcmrl_data.store import tables
-from tcmrl_data.store.keys import PARTS, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
+from tcmrl_data.store.tables import PARTS, PartKey, part_file
 from tests.simulated_disk import (
     FAULTS,
     LOSSES,

@@ -8,9 +8,8 @@ import pytest
 from tcmrl_data import Recipe, apply_overrides, canonical_json, list_environments, load_recipe
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
-from tcmrl_data.recipe.profile import PROFILES, Profile
-from tcmrl_data.recipe.recipe import full_settings
-from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.recipe import PROFILES, Profile
+from tcmrl_data.recipe.recipe import choose_tasks, full_settings
 from tcmrl_data.recipe.values import read_comments, recipe_values
 from tests.environments import some_members
 
@@ -91,7 +90,7 @@ def test_unknown_names_list_the_nearest() -> None:
 
 
 def test_a_source_without_settings_is_refused() -> None:
-    with pytest.raises(RecipeError, match=r"no \[behavior.scripted\] table"):
+    with pytest.raises(RecipeError, match=r"lacks behavior.scripted.noise; add it"):
         load_recipe("point-robot", behavior="scripted")
 
 

@@ -30,7 +30,7 @@ from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 from tests.commands import assert_refused, in_process
 
 pytestmark = pytest.mark.usefixtures("module_in_process")

@@ -21,7 +21,7 @@ from tcmrl_data.envs.base import ENVIRONMENTS, Environment
 from tcmrl_data.envs.controller import UniformController
 from tcmrl_data.envs.simulation import SimulatedTask, find_open_gl
 from tcmrl_data.foundation.errors import SelectionError, SimulationError
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 from tests.commands import Call, assert_refused, in_process
 from tests.environments import environment_of, episodes, parameters_of, some_members
 

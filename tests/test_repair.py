@@ -25,11 +25,10 @@ from tcmrl_data.foundation.errors import (
 from tcmrl_data.foundation.records import sealed
 from tcmrl_data.parts import rollouts
 from tcmrl_data.store import manifest as manifest_module
-from tcmrl_data.store import platform
-from tcmrl_data.store.keys import PARTS, PartKey, part_file
+from tcmrl_data.store import part
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import TASKS, seal_of
+from tcmrl_data.store.tables import PARTS, TASKS, PartKey, part_file, seal_of
 from tcmrl_data.verification import repair
 from tests.commands import in_process
 from tests.damage import data_files, found, ids_of, rot
@@ -191,8 +190,8 @@ def test_a_part_that_comes_out_differently_replaces_nothing(
 @pytest.fixture
 def another_processor(monkeypatch: pytest.MonkeyPatch) -> None:
     """This machine has another processor than the one that made the parts."""
-    here = platform._machine()
-    monkeypatch.setattr(platform, "_machine", lambda: here | {"cpu": "another one"})
+    here = part._machine()
+    monkeypatch.setattr(part, "_machine", lambda: here | {"cpu": "another one"})
 
 
 @pytest.mark.usefixtures("another_processor")

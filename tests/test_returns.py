@@ -2,12 +2,12 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import Dataset
-from tcmrl_data.dataset.returns import (
-    episode_table,
+from tcmrl_data.dataset.listing import (
     first_disagreement,
-    snapshot_table,
+    list_episodes,
+    list_snapshots,
+    list_tasks,
     summarize_returns,
-    task_table,
 )
 from tcmrl_data.foundation.errors import SelectionError, TaskError
 
@@ -96,17 +96,17 @@ def test_a_disagreement_names_task_step_and_field() -> None:
 
 
 def test_recomputed_returns_equal_the_recorded_ones(tiny: Dataset) -> None:
-    assert tcmrl_data.return_table(tiny, recompute=True) == tcmrl_data.return_table(tiny)
+    assert tcmrl_data.list_returns(tiny, recompute=True) == tcmrl_data.list_returns(tiny)
 
 
 def test_snapshot_and_task_tables_cover_the_dataset(tiny: Dataset) -> None:
-    rows = snapshot_table(tiny)["snapshots"]
+    rows = list_snapshots(tiny)["snapshots"]
     assert [(row["task"], row["step"], row["run"]) for row in rows] == list(tiny.parts)
-    assert [row["task"] for row in task_table(tiny)["tasks"]] == [task.index for task in tiny.tasks]
+    assert [row["task"] for row in list_tasks(tiny)["tasks"]] == [task.index for task in tiny.tasks]
 
 
 def test_episode_table_refuses_what_is_not_there(tiny: Dataset) -> None:
     with pytest.raises(TaskError, match="no task 7"):
-        episode_table(tiny, task=7)
+        list_episodes(tiny, task=7)
     with pytest.raises(SelectionError, match=r"step 77.*\[0, 100, 150\]"):
-        episode_table(tiny, step=77)
+        list_episodes(tiny, step=77)

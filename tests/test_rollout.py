@@ -7,16 +7,15 @@ import pytest
 from tcmrl_data import (
     Controller,
     Lanes,
+    LaneTransition,
     Recorder,
     Trajectory,
-    Transition,
     UniformController,
     load_recipe,
     roll_out,
 )
 from tcmrl_data.envs.base import Environment, LaneStep
-from tcmrl_data.envs.controller import View
-from tcmrl_data.envs.trajectory import BoolArray, FloatArray
+from tcmrl_data.envs.controller import BoolArray, FloatArray, ObservationView
 from tests.environments import environment_of, parameters_of
 
 
@@ -57,13 +56,13 @@ class Recording(Controller):
 
     def __init__(self) -> None:
         self.seen: list[int] = []
-        self.transitions: list[Transition] = []
+        self.transitions: list[LaneTransition] = []
 
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         self.seen.append(len(observations))
         return np.full((len(observations), 2), 3.0)
 
-    def observe(self, transition: Transition) -> None:
+    def observe(self, transition: LaneTransition) -> None:
         self.transitions.append(transition)
 
 
@@ -99,7 +98,7 @@ def test_the_controller_sees_every_lane_and_every_step_as_it_was_executed(enviro
 class Reconstructing(Controller):
     """Draws actions from its noise, and records every step that it observes."""
 
-    def __init__(self, view: View) -> None:
+    def __init__(self, view: ObservationView) -> None:
         self.view = view
         self.recorder = Recorder()
         self.lengths: list[list[int]] = []
@@ -108,7 +107,7 @@ class Reconstructing(Controller):
         self.lengths.append([len(trajectory) for trajectory in self.recorder.trajectories()])
         return 2 * noise
 
-    def observe(self, transition: Transition) -> None:
+    def observe(self, transition: LaneTransition) -> None:
         self.recorder.record(transition)
 
 
@@ -135,7 +134,7 @@ def test_a_controller_rebuilds_the_stored_trajectories_of_lanes_that_end_early(
 
 
 @pytest.mark.parametrize("view", ["stored", "full"])
-def test_a_controller_rebuilds_the_stored_trajectories_in_either_view(view: View) -> None:
+def test_a_controller_rebuilds_the_stored_trajectories_in_either_view(view: ObservationView) -> None:
     environment = environment_of("ml1/reach", "environment.horizon=4")
     controller = Reconstructing(view)
     stored = roll(environment, environment.lanes(parameters_of("ml1/reach")[:2]), controller)
@@ -146,7 +145,7 @@ def test_a_controller_rebuilds_the_stored_trajectories_in_either_view(view: View
 
 def test_recorded_steps_are_copies() -> None:
     recorder, array, active = Recorder(), np.ones((1, 2), np.float32), np.ones(1, dtype=bool)
-    recorder.record(Transition(array, array, array[:, 0], array, ~active, ~active, active))
+    recorder.record(LaneTransition(array, array, array[:, 0], array, ~active, ~active, active))
     array[:] = 7.0
     (trajectory,) = recorder.trajectories()
     assert (trajectory.observations == 1.0).all() and (trajectory.actions == 1.0).all()

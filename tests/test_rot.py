@@ -9,10 +9,9 @@ import pytest
 
 from tcmrl_data import open_dataset, repair_dataset, verify_dataset
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.store.keys import PARTS
 from tcmrl_data.store.manifest import MANIFEST, restore_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import TASKS
+from tcmrl_data.store.tables import PARTS, TASKS
 from tcmrl_data.verification import repair as repair_module
 from tests.hostile.datasets import base, copies_of
 

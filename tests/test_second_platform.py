@@ -14,7 +14,7 @@ from tcmrl_data import BuildEvent, load_recipe, open_dataset, verify_dataset
 from tcmrl_data.building.events import EVENTS
 from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK
-from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.store.tables import PartKey, part_file
 from tests.conftest import TASKS, TINY
 from tests.disks import COMMAND_LINE
 from tests.platforms import AVX2

@@ -13,8 +13,7 @@ from stable_baselines3 import SAC
 
 import tcmrl_data
 from tcmrl_data import Recipe, load_recipe, open_dataset
-from tcmrl_data.behavior.base import BehaviorContext
-from tcmrl_data.behavior.checkpoints import CheckpointFolder
+from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.behavior.stacked import StackedSource
 from tcmrl_data.behavior.stacked_training import GroupTraining
@@ -25,9 +24,9 @@ from tcmrl_data.building.work_files import checkpoint_name
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import CHECKPOINTS, make_folders
 from tcmrl_data.foundation.errors import BuildError
-from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
-from tcmrl_data.store.keys import PartKey, part_file
+from tcmrl_data.recipe.recipe import choose_tasks, group_tasks
 from tcmrl_data.store.manifest import MANIFEST
+from tcmrl_data.store.tables import PartKey, part_file
 from tcmrl_data.verification.cleaning import collect_garbage
 from tcmrl_data.verification.repair import repair_dataset
 from tests.datasets import part_ids

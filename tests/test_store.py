@@ -17,7 +17,7 @@ from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.store import arrays as store_module
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.arrays import encode_arrays, pack, read_arrays, unpack
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 from tests.strategies import trajectories
 
 PART = PartKey(0, 150)

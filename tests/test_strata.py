@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, Task, load_recipe, open_dataset, split_dataset
-from tcmrl_data.dataset.returns import ParameterShift, parameter_shifts
-from tcmrl_data.envs.tasks import draw_from_strata, draw_tasks, in_order, middles_of_strata
+from tcmrl_data.dataset.listing import ParameterShift, parameter_shifts
+from tcmrl_data.envs.base import draw_from_strata, draw_tasks, in_order, middles_of_strata
 from tcmrl_data.foundation.errors import RecipeError
-from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.recipe.recipe import choose_tasks
 from tests.commands import in_process
 from tests.environments import environment_of
 from tests.graded import graded_dataset, graded_recipe

@@ -12,10 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tcmrl_data import load_recipe
-from tcmrl_data.envs.base import ENVIRONMENTS
-from tcmrl_data.envs.tasks import PARAMETER_DIGITS, Task, draw_tasks
+from tcmrl_data.envs.base import ENVIRONMENTS, PARAMETER_DIGITS, Task, draw_tasks
 from tcmrl_data.foundation.errors import TaskError
-from tcmrl_data.recipe.tasks import choose_tasks, parse_indices, spread
+from tcmrl_data.recipe.recipe import choose_tasks, parse_indices, spread
 from tests.environments import environment_of, parameters_of, some_members
 from tests.platforms import OTHER_PLATFORMS
 
@@ -25,7 +24,7 @@ NAMES = [name for family in ENVIRONMENTS.working().values() for name in some_mem
 DRAW = """
 import json, sys
 from tcmrl_data import load_recipe
-from tcmrl_data.envs.tasks import draw_tasks
+from tcmrl_data.envs.base import draw_tasks
 for name in sys.argv[1:]:
     tasks = draw_tasks(load_recipe(name).make_environment())
     print(json.dumps([[task.index, task.split, task.parameters] for task in tasks]))

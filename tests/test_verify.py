@@ -20,11 +20,10 @@ from tcmrl_data.foundation.errors import (
     ManifestError,
 )
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.keys import PartKey, part_file, part_folder
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tcmrl_data.store.part import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import TASKS, read_lines
+from tcmrl_data.store.tables import TASKS, PartKey, part_file, part_folder, read_lines
 from tcmrl_data.verification import replay as replay_module
 from tests.commands import in_process
 from tests.damage import data_files, found, rot

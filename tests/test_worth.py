@@ -12,8 +12,8 @@ from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
 from tcmrl_data.quality.measured import PartSteps
 from tcmrl_data.quality.transfer import Transfer, TransferTask
 from tcmrl_data.quality.worth import Half, Sample, context_worth, draw_sample, visibility
-from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part import References
+from tcmrl_data.store.tables import PartKey
 from tests.commands import Call, assert_refused, in_process
 from tests.graded import graded_dataset, made_dataset
 from tests.test_coverage import episode

@@ -8,7 +8,7 @@ import pytest
 
 from tcmrl_data import Recipe
 from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder
-from tcmrl_data.recipe.tasks import choose_tasks
+from tcmrl_data.recipe.recipe import choose_tasks
 
 Digests = dict[tuple[int, int], str]
 """Digests of snapshots by task and step."""

@@ -65,10 +65,10 @@ from tcmrl_data import (
     Batch,
     BatchRequest,
     Controller,
+    LaneTransition,
     Steps,
     Trajectories,
     Trajectory,
-    Transition,
     UniformController,
 )
 
@@ -424,7 +424,7 @@ class BeliefController(FunctionController):
     def _choose(self, states: Float[Tensor, "lanes observation"]) -> Float[Tensor, "lanes action"]:
         return self._actor_critic.act(states, self._learner.encoder.beliefs(self._hidden).context)
 
-    def observe(self, transition: Transition) -> None:
+    def observe(self, transition: LaneTransition) -> None:
         def tensor(values: Any) -> Tensor:
             return torch.as_tensor(values, dtype=torch.float32, device=self._hidden.device)
 

@@ -7,7 +7,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.experiment.results import rounded
-from tcmrl_data import Dataset, return_table
+from tcmrl_data import Dataset, list_returns
 
 
 class SnapshotReturns(BaseModel):
@@ -51,7 +51,7 @@ class DatasetReturns(BaseModel):
 
 def dataset_returns(dataset: Dataset) -> DatasetReturns:
     """Mean returns of the stored episodes of a dataset, over tasks, by snapshot."""
-    tasks = return_table(dataset)["tasks"]
+    tasks = list_returns(dataset)["tasks"]
     steps: list[int | None] = sorted({found["step"] for task in tasks for found in task["snapshots"]})
     return DatasetReturns(
         environment=dataset.name,

@@ -14,11 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
-from tcmrl_data.behavior.checkpoints import TrainingState
+from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot, snapshot_of_sac
-from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Environment, Task
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
-from tcmrl_data.envs.controller import View
+from tcmrl_data.envs.controller import ObservationView
 from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.disk import make_folders, write_tree
 from tcmrl_data.foundation.errors import SnapshotError
@@ -35,7 +35,7 @@ RELU = "<class 'torch.nn.modules.activation.ReLU'>"
 FLATTEN = "stable_baselines3.common.torch_layers.FlattenExtractor"
 
 
-def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
+def import_sac(file: Path, out: Path, *, observation: ObservationView) -> Snapshot:
     """Imports the actor of a Stable-Baselines3 zip file into a new folder with `policy.json` and its weights.
 
     Runs no code of the file.
@@ -58,7 +58,7 @@ def import_sac(file: Path, out: Path, *, observation: View) -> Snapshot:
     return snapshot
 
 
-def read_sac(file: Path, *, observation: View) -> Snapshot:
+def read_sac(file: Path, *, observation: ObservationView) -> Snapshot:
     """The actor of a Stable-Baselines3 zip file; arguments and errors as of `import_sac`."""
     try:
         with open_plain_file(file.resolve(), limit=LARGEST_FILE) as opened:

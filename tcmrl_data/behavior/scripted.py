@@ -7,8 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
 from tcmrl_data.behavior.snapshot import ScriptedDescription, Snapshot
-from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Environment, Task
 
 
 class ScriptedSettings(BaseModel):

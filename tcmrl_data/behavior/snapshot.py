@@ -10,8 +10,7 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from tcmrl_data.envs.base import Environment, Parameters
-from tcmrl_data.envs.controller import Controller, View
-from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.envs.controller import Controller, FloatArray, ObservationView
 from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json, sha256
 from tcmrl_data.foundation.errors import SnapshotError, StoreError
 from tcmrl_data.foundation.plain_files import one_line, printable
@@ -33,7 +32,7 @@ HEADER_BYTES = 2**16
 class _Description(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
-    observation: View
+    observation: ObservationView
 
 
 class GaussianDescription(_Description):
@@ -88,7 +87,7 @@ class Snapshot:
 
     @classmethod
     def of_network(
-        cls, step: int, observation: View, tensors: Mapping[str, npt.NDArray[np.float32]]
+        cls, step: int, observation: ObservationView, tensors: Mapping[str, npt.NDArray[np.float32]]
     ) -> "Snapshot":
         """A snapshot of a Gaussian policy with the sizes of its tensors."""
         biases = [name for name in tensors if name.startswith("hidden.") and name.endswith(".bias")]
@@ -173,7 +172,7 @@ def _read_tensors(
     return tensors
 
 
-def snapshot_of_sac(model: "SAC", *, step: int, observation: View) -> Snapshot:
+def snapshot_of_sac(model: "SAC", *, step: int, observation: ObservationView) -> Snapshot:
     """Makes a snapshot of a Stable-Baselines3 SAC's actor."""
     actor = model.policy.actor
     layers = [layer for layer in actor.latent_pi if hasattr(layer, "weight")]

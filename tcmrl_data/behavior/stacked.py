@@ -14,8 +14,7 @@ from pydantic import Field
 from tcmrl_data.behavior.base import BehaviorContext
 from tcmrl_data.behavior.sac import SacSettings, SacTraining
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Environment, Task
 from tcmrl_data.foundation.errors import BuildError
 
 REPORT_EVERY = 20

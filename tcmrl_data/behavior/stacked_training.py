@@ -13,12 +13,11 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from tcmrl_data.behavior.base import BehaviorContext
-from tcmrl_data.behavior.checkpoints import TrainingState
+from tcmrl_data.behavior.base import BehaviorContext, TrainingState
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.behavior.stacked import StackedSettings
 from tcmrl_data.behavior.stacked_learner import ReplayBatch, StackedSac
-from tcmrl_data.envs.trajectory import BoolArray, FloatArray
+from tcmrl_data.envs.controller import BoolArray, FloatArray
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 

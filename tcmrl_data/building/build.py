@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.behavior.checkpoints import CHECKPOINT_SECONDS
+from tcmrl_data.behavior.base import CHECKPOINT_SECONDS
 from tcmrl_data.building.events import BuildEvent, EventKind, EventLog
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.nodes import check_nodes
@@ -17,7 +17,7 @@ from tcmrl_data.building.plan import plan_build
 from tcmrl_data.building.unit import UnitSpec
 from tcmrl_data.building.work_files import ASSEMBLY, WORK_FILES, WORK_FOLDERS, check_work_files
 from tcmrl_data.engine.base import BaseEngine, Result, Unit, make_engine
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.canonical import differences
 from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
@@ -25,11 +25,10 @@ from tcmrl_data.foundation.locks import VISIBLE_SECONDS
 from tcmrl_data.foundation.machine import size
 from tcmrl_data.parts.making import Published
 from tcmrl_data.recipe.recipe import Recipe, full_settings
-from tcmrl_data.store.keys import PARTS, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part import DATA_VERSION
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import TASKS
+from tcmrl_data.store.tables import PARTS, TASKS, PartKey, part_file
 
 SEEDS = 2**63
 """Seeds are stored as int64, in exports too."""

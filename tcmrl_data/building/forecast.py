@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
-from tcmrl_data.behavior.checkpoints import CheckpointFolder
+from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.unit import PartMaker, UnitSpec
 from tcmrl_data.engine.base import ENGINES, Unit
 from tcmrl_data.engine.worker import Send, serve
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.machine import available_cores
 

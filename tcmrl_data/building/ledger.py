@@ -21,7 +21,6 @@ from tcmrl_data.foundation.plain_files import file_problem, folder_problem, stat
 from tcmrl_data.parts.making import Published, read_published
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.keys import MAIN_RUN, MAX_PLATFORMS, PartKey, key_of_file, part_file, part_folder
 from tcmrl_data.store.manifest import MANIFEST, Run, manifest_bytes, read_manifest, write_manifest
 from tcmrl_data.store.part import DATA_VERSION
 from tcmrl_data.store.part_table import (
@@ -33,7 +32,20 @@ from tcmrl_data.store.part_table import (
     parse_parts,
     part_line,
 )
-from tcmrl_data.store.tables import TASKS, TableWriter, parse_tasks, read_log, read_sealed, task_line
+from tcmrl_data.store.tables import (
+    MAIN_RUN,
+    MAX_PLATFORMS,
+    TASKS,
+    PartKey,
+    TableWriter,
+    key_of_file,
+    parse_tasks,
+    part_file,
+    part_folder,
+    read_log,
+    read_sealed,
+    task_line,
+)
 
 SEAL_SECONDS = 1.0
 SEAL_SHARE = 0.05

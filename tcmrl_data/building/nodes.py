@@ -14,7 +14,7 @@ from tcmrl_data.foundation.disk import STAGING, make_folders, write_file
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.locks import wait_until_visible
 from tcmrl_data.foundation.records import as_model
-from tcmrl_data.store.platform import Platform
+from tcmrl_data.store.part import Platform
 
 WORKER = "tcmrl_data.building.nodes"
 """Module that describes a machine."""
@@ -144,7 +144,7 @@ def work(spec: dict[str, Any], report: Send) -> str:
 
 def _own_platform(recipe: dict[str, Any]) -> dict[str, Any]:
     from tcmrl_data.recipe.recipe import Recipe
-    from tcmrl_data.store.platform import this_platform
+    from tcmrl_data.store.part import this_platform
 
     resolved = as_model(Recipe, recipe)
     platform = this_platform(resolved.make_environment(), resolved.behavior.source)

@@ -5,14 +5,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 from tcmrl_data.behavior.base import BehaviorSource
-from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Environment, Task
 from tcmrl_data.foundation.errors import TaskError
-from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.recipe.tasks import choose_tasks, group_tasks
-from tcmrl_data.store.keys import check_plan
-from tcmrl_data.store.platform import Platform, this_platform
-from tcmrl_data.store.tables import task_line
+from tcmrl_data.recipe.recipe import Recipe, choose_tasks, group_tasks
+from tcmrl_data.store.part import Platform, this_platform
+from tcmrl_data.store.tables import check_plan, task_line
 
 PROCESS_BYTES = 400 * 2**20
 """A worker beside its data: torch, MuJoCo and Zarr take about 310 MB as measured; the rest is margin."""

@@ -9,13 +9,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
-from tcmrl_data.behavior.checkpoints import CHECKPOINT_SECONDS, CheckpointFolder
+from tcmrl_data.behavior.base import CHECKPOINT_SECONDS, BehaviorContext, BehaviorSource, CheckpointFolder
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.work_files import checkpoint_name
 from tcmrl_data.engine.worker import Send, serve
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.errors import NondeterminismError
 from tcmrl_data.foundation.records import as_model
@@ -24,8 +23,8 @@ from tcmrl_data.parts.operation import Simulator, Sources, WantedPart
 from tcmrl_data.parts.rollouts import Rollout, measure_references
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.part import DATA_VERSION, PartRecord, References, read_part_record
+from tcmrl_data.store.tables import MAIN_RUN, PartKey, part_file
 
 
 @dataclass(frozen=True)

@@ -8,14 +8,13 @@ from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from tcmrl_data.building.events import EARLIER_EVENTS, EVENTS
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.plain_files import file_problem
-from tcmrl_data.store.keys import PARTS
 from tcmrl_data.store.manifest import MANIFEST_COPY
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import TASKS
+from tcmrl_data.store.tables import PARTS, TASKS
 
 WORK_FOLDERS = {STAGING, CHECKPOINTS}
 ASSEMBLY = ".assembly.json"

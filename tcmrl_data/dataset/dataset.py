@@ -13,11 +13,9 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import Snapshot, read_snapshot
-from tcmrl_data.dataset.selection import Selection, chosen_parts
-from tcmrl_data.dataset.view_file import ViewFile, is_view_file, read_view
-from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Split, Task, draw_tasks
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.dataset.selection import Selection, ViewFile, chosen_parts, is_view_file, read_view
+from tcmrl_data.envs.base import Environment, Split, Task, draw_tasks
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.errors import (
     ManifestError,
@@ -32,11 +30,10 @@ from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.foundation.records import first_problem
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
-from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, Manifest, dataset_folder, read_manifest
 from tcmrl_data.store.part import PartRecord, References, check_members, read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, REFERENCES, PartEntry, PartTable, parse_parts
-from tcmrl_data.store.tables import TASKS, parse_tasks, read_sealed
+from tcmrl_data.store.tables import MAIN_RUN, TASKS, PartKey, parse_tasks, part_file, read_sealed
 
 KEPT_RECORDS = 1000
 """Records of parts that stay in memory, about 10 kB each."""

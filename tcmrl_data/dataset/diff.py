@@ -11,8 +11,8 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part import STANDARD_ARRAYS, Identity
+from tcmrl_data.store.tables import PartKey
 
 Stage = Literal["data version", "settings", "seed", "parameters", "derivation", "policy", "arrays"]
 

@@ -1,15 +1,25 @@
-"""Which datasets lie below a folder, and a dataset on one screen."""
+"""Which datasets lie below a folder; what a dataset holds, as JSON documents; how far its test tasks lie.
 
+Returns are undiscounted sums of the stored rewards.
+"""
+
+import math
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.envs.base import Split, Task, place_in_order
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.disk import STAGING
-from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.store.keys import PARTS
+from tcmrl_data.foundation.errors import ManifestError, SelectionError, TcmrlError
 from tcmrl_data.store.manifest import MANIFEST, Manifest, read_manifest
+from tcmrl_data.store.part_table import PartEntry
+from tcmrl_data.store.tables import PARTS
 
 
 def list_datasets(root: str | Path) -> list[dict[str, Any]]:
@@ -84,3 +94,270 @@ def _versions(packages: dict[str, str]) -> str:
 
 def _distinct(values: Iterable[str]) -> list[str]:
     return sorted(set(values))
+
+
+SPLITS: tuple[Split, ...] = ("train", "test")
+RETURN_FIELDS = ("episodes", "steps", "mean", "std", "min", "max", "success_rate")
+
+
+def list_returns(dataset: Dataset, recompute: bool = False) -> dict[str, Any]:
+    """Returns per task and snapshot, the document of `tcmrl-data inspect returns --json`.
+
+    Args:
+        dataset: the dataset; of an incomplete one, what is there.
+        recompute: sum the stored rewards instead of reading the table of parts.
+
+    Returns:
+        `{"name", "environment", "tasks": [{"task", "split", "snapshots": [{"step", "run", "episodes",
+        "steps", "mean", "std", "min", "max", "success_rate"}]}]}`; mean to max are over a snapshot's
+        episodes, std is the population's, success_rate is null without a success signal.
+
+    Example:
+        >>> import tcmrl_data
+        >>> dataset = tcmrl_data.open_dataset("data/point-robot")  # doctest: +SKIP
+        >>> tcmrl_data.list_returns(dataset)["tasks"][0]["split"]  # doctest: +SKIP
+        'train'
+    """
+    return _heading(dataset) | {
+        "tasks": [
+            {
+                "task": task.index,
+                "split": task.split,
+                "snapshots": [
+                    {"step": entry.step, "run": entry.run} | _returns(dataset, entry, recompute)
+                    for entry in dataset.parts.entries_of(task.index)
+                ],
+            }
+            for task in dataset.tasks
+        ]
+    }
+
+
+def list_tasks(dataset: Dataset) -> dict[str, Any]:
+    """Parameters and reference returns of every task, and how far test tasks lie from training tasks.
+
+    References are null while a task is incomplete; `shift` is explained by `ParameterShift`.
+    """
+    return _heading(dataset) | {
+        "shift": shift_rows(dataset),
+        "tasks": [
+            {
+                "task": task.index,
+                "split": task.split,
+                "parameters": dict(task.parameters),
+                "references": None
+                if dataset.missing(task.index)
+                else dataset.references(task.index).model_dump(),
+            }
+            for task in dataset.tasks
+        ],
+    }
+
+
+def list_snapshots(dataset: Dataset) -> dict[str, Any]:
+    """Every part: task, split, step, run, id, episodes, steps and mean return."""
+    rows = [
+        {"task": task.index, "split": task.split}
+        | {name: getattr(entry, name) for name in ("step", "run", "id", "episodes", "steps", "mean")}
+        for task in dataset.tasks
+        for entry in dataset.parts.entries_of(task.index)
+    ]
+    return _heading(dataset) | {"snapshots": rows}
+
+
+def list_episodes(dataset: Dataset, *, task: int | None = None, step: int | None = None) -> dict[str, Any]:
+    """Every episode: length, return, how it ended, and whether it succeeded at any step.
+
+    Args:
+        dataset: the dataset.
+        task: only this task.
+        step: only snapshots of this step.
+
+    Raises:
+        TaskError: the dataset does not hold the task.
+        SelectionError: no part is left.
+    """
+    tasks = dataset.tasks if task is None else (dataset.task(task),)
+    keys = [
+        key for one in tasks for key in dataset.parts.keys_of(one.index) if step is None or key.step == step
+    ]
+    if not keys:
+        steps = sorted({key.step for one in tasks for key in dataset.parts.keys_of(one.index)})
+        raise SelectionError(f"{dataset.folder} has no snapshot of step {step}; its steps are {steps}")
+    rows = [
+        {"task": key.task, "step": key.step, "run": key.run, "episode": episode} | _episode(trajectory)
+        for key in keys
+        for episode, trajectory in enumerate(dataset.trajectories(*key))
+    ]
+    return _heading(dataset) | {"episodes": rows}
+
+
+def summarize_returns(table: dict[str, Any]) -> list[dict[str, Any]]:
+    """One row per snapshot step and split: mean, std, min, max over the tasks' mean returns.
+
+    Args:
+        table: what `list_returns` made.
+    """
+    steps = sorted({found["step"] for task in table["tasks"] for found in task["snapshots"]})
+    rows = []
+    for step in steps:
+        for split in SPLITS:
+            found = list(_at(table, step, split))
+            if not found:
+                continue
+            means = np.array([row["mean"] for row in found])
+            success = [row["success_rate"] for row in found if row["success_rate"] is not None]
+            rows.append(
+                {
+                    "step": step,
+                    "split": split,
+                    "tasks": len(found),
+                    "episodes": sum(row["episodes"] for row in found),
+                    "mean": float(means.mean()),
+                    "std": float(means.std()),
+                    "min": float(means.min()),
+                    "max": float(means.max()),
+                    "success_rate": float(np.mean(success)) if success else None,
+                }
+            )
+    return rows
+
+
+def first_disagreement(recorded: dict[str, Any], recomputed: dict[str, Any]) -> str | None:
+    """Where recomputed returns differ from the recorded ones, in words; None where they agree."""
+    for old, new in zip(recorded["tasks"], recomputed["tasks"], strict=True):
+        for before, after in zip(old["snapshots"], new["snapshots"], strict=True):
+            for field in RETURN_FIELDS:
+                if not _agree(before[field], after[field]):
+                    place = f"task {old['task']} at step {before['step']}"
+                    return (
+                        f"{place}: {field} is {before[field]} in parts.jsonl and {after[field]} in the data"
+                    )
+    return None
+
+
+def _heading(dataset: Dataset) -> dict[str, Any]:
+    return {"name": dataset.manifest.name, "environment": dataset.name}
+
+
+def _returns(dataset: Dataset, entry: PartEntry, recompute: bool) -> dict[str, Any]:
+    if not recompute:
+        return {field: getattr(entry, field) for field in RETURN_FIELDS}
+    trajectories = dataset.trajectories(*entry.key)
+    returns = np.array([trajectory.undiscounted_return for trajectory in trajectories])
+    success = [flag for flag in map(_success, trajectories) if flag is not None]
+    return {
+        "episodes": len(trajectories),
+        "steps": sum(map(len, trajectories)),
+        "mean": float(returns.mean()),
+        "std": float(returns.std()),
+        "min": float(returns.min()),
+        "max": float(returns.max()),
+        "success_rate": float(np.mean(success)) if success else None,
+    }
+
+
+def _episode(trajectory: Trajectory) -> dict[str, Any]:
+    return {
+        "length": len(trajectory),
+        "return": trajectory.undiscounted_return,
+        "terminated": bool(trajectory.terminated.any()),
+        "truncated": bool(trajectory.truncated.any()),
+        "success": _success(trajectory),
+    }
+
+
+def _success(trajectory: Trajectory) -> bool | None:
+    return bool(np.any(trajectory.extras["success"])) if "success" in trajectory.extras else None
+
+
+def _at(table: dict[str, Any], step: int, split: str) -> Iterator[dict[str, Any]]:
+    for task in table["tasks"]:
+        if task["split"] == split:
+            yield from (found for found in task["snapshots"] if found["step"] == step)
+
+
+def _agree(recorded: float | None, recomputed: float | None) -> bool:
+    if recorded is None or recomputed is None:
+        return recorded is recomputed
+    return bool(np.isclose(recorded, recomputed, rtol=1e-9, atol=1e-9))
+
+
+LARGEST = 1e300
+"""Numbers from here on are left out; an integer may have more digits than a float."""
+
+
+@dataclass(frozen=True)
+class ParameterShift:
+    """One number of the tasks' parameters, in training and in test tasks.
+
+    Attributes:
+        parameter: what it is: the environment's ordering, or the dotted place of a number.
+        train: mean over the training tasks.
+        test: mean over the test tasks.
+        difference: test minus train.
+        standardized: the difference in standard deviations of the training tasks; None where these are equal
+            and the test tasks differ from them.
+    """
+
+    parameter: str
+    train: float
+    test: float
+    difference: float
+    standardized: float | None
+
+
+def parameter_shifts(dataset: Dataset) -> list[ParameterShift]:
+    """The shift of the environment's ordering, or of every number of the parameters where it has none.
+
+    Numbers that are equal in all tasks are left out. Empty without training or without test tasks.
+    """
+    splits = (dataset.train_tasks, dataset.test_tasks)
+    train, test = ([_numbers(dataset, task) for task in tasks] for tasks in splits)
+    if not train or not test:
+        return []
+    names = [name for name in train[0] if all(name in found for found in (*train, *test))]
+    shifts = (
+        _shift(name, [found[name] for found in train], [found[name] for found in test]) for name in names
+    )
+    return [shift for shift in shifts if shift is not None]
+
+
+def shift_rows(dataset: Dataset) -> list[dict[str, Any]]:
+    """The shifts as JSON: `{"parameter", "train", "test", "difference", "standardized"}`."""
+    return [asdict(shift) for shift in parameter_shifts(dataset)]
+
+
+def _shift(name: str, train: Sequence[float], test: Sequence[float]) -> ParameterShift | None:
+    if len({*train, *test}) == 1:
+        return None
+    with np.errstate(over="ignore", invalid="ignore"):  # a stranger's numbers may be of any size
+        means, scale = (float(np.mean(train)), float(np.mean(test))), float(np.std(train))
+        difference = means[1] - means[0]
+    if not math.isfinite(difference) or not math.isfinite(scale):
+        return None
+    return ParameterShift(name, *means, difference, difference / scale if scale > 0 else None)
+
+
+def _numbers(dataset: Dataset, task: Task) -> dict[str, float]:
+    """The task's place in the environment's ordering, or all numbers of its parameters by dotted names."""
+    try:
+        environment = dataset.environment
+    except TcmrlError:  # its package is not installed: what the parameters say is all that is known
+        return dict(_flat(task.parameters))
+    place = place_in_order(environment, task)
+    if place is None or environment.ordering_name is None:
+        return dict(_flat(task.parameters))
+    return {environment.ordering_name: place}
+
+
+def _flat(value: Any, place: str = "") -> Iterator[tuple[str, float]]:
+    items: Iterator[tuple[Any, Any]] = iter(())
+    if isinstance(value, Mapping):
+        items = iter(value.items())
+    elif isinstance(value, list | tuple):
+        items = iter(enumerate(value))
+    elif isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < LARGEST:
+        yield place, float(value)
+    for name, member in items:
+        yield from _flat(member, f"{place}.{name}" if place else str(name))

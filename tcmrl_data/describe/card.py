@@ -10,8 +10,7 @@ import numpy as np
 import yaml
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.dataset.listing import dataset_summary
-from tcmrl_data.dataset.returns import return_table, summarize_returns
+from tcmrl_data.dataset.listing import dataset_summary, list_returns, summarize_returns
 from tcmrl_data.dataset.selection import TIERS
 from tcmrl_data.describe.cite import citation_text
 from tcmrl_data.foundation.disk import replace_file
@@ -75,7 +74,7 @@ def dataset_card(dataset: Dataset, *, kept: str = "") -> str:
     manifest, summary, quality = dataset.manifest, dataset_summary(dataset), measure_quality(dataset)
     front_matter = _front_matter(dataset, summary)
     spreads = {(stage.step, stage.split): stage.tq for stage in quality.stages}
-    returns = summarize_returns(return_table(dataset))
+    returns = summarize_returns(list_returns(dataset))
     for row in returns:
         spread = spreads.get((row["step"], row["split"]))
         row["tq"] = None if spread is None else spread.iqm

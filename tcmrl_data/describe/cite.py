@@ -10,7 +10,7 @@ from typing import Any, Literal
 import yaml
 
 from tcmrl_data.foundation.errors import TcmrlError
-from tcmrl_data.recipe.about import AND, Reference, is_listed
+from tcmrl_data.recipe.document import AND, Reference, is_listed
 from tcmrl_data.recipe.recipe import load_recipe
 from tcmrl_data.store.manifest import Manifest
 

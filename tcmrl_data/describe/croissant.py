@@ -16,10 +16,10 @@ from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.describe.cite import citation_of, citation_text
 from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.disk import STAGING, replace_file
-from tcmrl_data.recipe.about import is_listed
-from tcmrl_data.store.keys import PARTS, part_file
+from tcmrl_data.recipe.document import is_listed
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part_table import PartEntry
+from tcmrl_data.store.tables import PARTS, part_file
 
 CONFORMS_TO = ("http://mlcommons.org/croissant/1.0", "http://mlcommons.org/croissant/RAI/1.0")
 

@@ -11,13 +11,13 @@ import numpy.typing as npt
 from markupsafe import Markup
 from plotly.graph_objects import Bar, Figure, Heatmap, Scatter
 
-from tcmrl_data.dataset.returns import SPLITS, summarize_returns
+from tcmrl_data.dataset.listing import SPLITS, summarize_returns
 from tcmrl_data.describe.measures import ACTION_BINS, BROWSED_COLUMNS, Browsed, Content
 from tcmrl_data.foundation.seeding import evenly_spread
 from tcmrl_data.page.page import escaped
 from tcmrl_data.quality.measured import STEPS_LABEL, TICKS
 from tcmrl_data.quality.transfer import Transfer
-from tcmrl_data.store.keys import MAIN_RUN, PartKey
+from tcmrl_data.store.tables import MAIN_RUN, PartKey
 
 COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00", "#444444", "#8C6D1F")
 """Okabe and Ito's palette, which the color-blind can tell apart, without its light yellow."""

@@ -9,14 +9,20 @@ import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.base import Camera, Environment, EnvironmentLanes, Picture
-from tcmrl_data.envs.controller import Controller, PlaybackController, Transition, View
+from tcmrl_data.envs.controller import (
+    Controller,
+    FloatArray,
+    LaneTransition,
+    ObservationView,
+    PlaybackController,
+    Trajectory,
+)
 from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.simulation import check_chosen_open_gl
-from tcmrl_data.envs.trajectory import FloatArray, Trajectory
 from tcmrl_data.foundation.errors import RenderingError, SelectionError, SimulationError
 from tcmrl_data.foundation.seeding import Purpose, evenly_spread, keyed_seed
 from tcmrl_data.parts.making import operation_of
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 
 @dataclass(frozen=True)
@@ -117,7 +123,7 @@ def film(
 class _FilmingController(Controller):
     """Plays one stored episode, compares every step with it, and takes pictures at some moments."""
 
-    view: View = "full"
+    view: ObservationView = "full"
 
     def __init__(
         self,
@@ -138,7 +144,7 @@ class _FilmingController(Controller):
             self._see(observations[0])
         return self._playback.act(observations, noise)
 
-    def observe(self, transition: Transition) -> None:
+    def observe(self, transition: LaneTransition) -> None:
         stored, step = self._episode.trajectory, len(self._seen) - 1
         for name, there, here in (
             ("reward", stored.rewards[step], transition.rewards[0]),

@@ -8,18 +8,17 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.dataset.listing import dataset_summary
-from tcmrl_data.dataset.returns import return_table, task_table
+from tcmrl_data.dataset.listing import dataset_summary, list_returns, list_tasks
 from tcmrl_data.describe.render import Strips, film_strips
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import FloatArray, Trajectory
+from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import FloatArray, Trajectory
 from tcmrl_data.foundation.errors import SelectionError, TcmrlError
 from tcmrl_data.foundation.seeding import evenly_spread
 from tcmrl_data.quality.coverage import Coverage, measure_coverage
 from tcmrl_data.quality.rewards import Rewards, measure_rewards
 from tcmrl_data.quality.scores import Quality, measure_quality
 from tcmrl_data.quality.transfer import Transfer, measure_transfer
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 SHOWN_TASKS = 100
 """Tasks with a map of visits, paths and a learning curve; of more tasks, evenly chosen ones."""
@@ -140,8 +139,8 @@ def measure(
     return Content(
         dataset,
         dataset_summary(dataset),
-        return_table(dataset),
-        task_table(dataset),
+        list_returns(dataset),
+        list_tasks(dataset),
         shown,
         plane,
         measure_quality(dataset),

@@ -14,13 +14,12 @@ import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.describe.film import Frame, StoredEpisode, film, find_episode
-from tcmrl_data.envs.base import Picture
-from tcmrl_data.envs.tasks import Task, place_in_order
+from tcmrl_data.envs.base import Picture, Task, place_in_order
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import RenderingError, SelectionError, SimulationError
 from tcmrl_data.quality.transfer import last_part
-from tcmrl_data.store.keys import MAIN_RUN, PartKey
-from tcmrl_data.store.platform import this_platform
+from tcmrl_data.store.part import this_platform
+from tcmrl_data.store.tables import MAIN_RUN, PartKey
 
 ENDINGS = (".webp", ".png", ".mp4")
 STRIP_ENDING = ".png"

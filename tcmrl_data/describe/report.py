@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.dataset.returns import summarize_returns
+from tcmrl_data.dataset.listing import summarize_returns
 from tcmrl_data.describe.card import tier_rows
 from tcmrl_data.describe.measures import Content, StageProgress, measure
 from tcmrl_data.describe.verdicts import judge

@@ -19,9 +19,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.envs.base import EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.base import EnvironmentSettings, ObservationView, Parameters, Reward
+from tcmrl_data.envs.controller import FloatArray
 from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, Viewpoint, squared_norm
-from tcmrl_data.envs.trajectory import FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -80,7 +80,7 @@ class AntDir(SimulatedEnvironment):
         return float(parameters["direction"])
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
+        self, parameters: Parameters, *, view: ObservationView = "stored", reward: Reward = "stored"
     ) -> "AntDirTask":
         return AntDirTask(self, parameters)
 
@@ -131,7 +131,7 @@ class AntGoal(SimulatedEnvironment):
         return math.atan2(y, x) % math.tau
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
+        self, parameters: Parameters, *, view: ObservationView = "stored", reward: Reward = "stored"
     ) -> "AntGoalTask":
         return AntGoalTask(self, parameters)
 

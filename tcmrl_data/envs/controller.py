@@ -1,20 +1,82 @@
-"""Controllers, which choose the actions of a batch of lanes."""
+"""Trajectories, and the controllers that choose the actions of a batch of lanes."""
 
 import abc
-from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import Literal, final
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, final
 
 import numpy as np
+import numpy.typing as npt
 
-from tcmrl_data.envs.trajectory import BoolArray, FloatArray
+from tcmrl_data.foundation.errors import TrajectoryError
 
-View = Literal["stored", "full"]
+FloatArray = npt.NDArray[np.floating]
+BoolArray = npt.NDArray[np.bool_]
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """T steps of one episode with T + 1 observations.
+
+    Attributes:
+        observations: (T + 1, observation_dim); the last one follows the last action.
+        actions: (T, action_dim) in [-1, 1], as executed.
+        rewards: (T,), for the state after the step.
+        terminated: (T,) bool; True if the task ended the episode at this step.
+        truncated: (T,) bool; True if a time limit ended the episode at this step.
+        extras: further per-step arrays of shape (T,), such as `success`.
+
+    Raises:
+        TrajectoryError: the lengths or ranks of the arrays do not match; the message states both.
+
+    Example:
+        >>> import numpy as np
+        >>> flags = np.zeros(3, dtype=bool)
+        >>> trajectory = Trajectory(np.zeros((4, 2)), np.zeros((3, 1)), np.ones(3), flags, flags)
+        >>> len(trajectory), trajectory.undiscounted_return
+        (3, 3.0)
+    """
+
+    observations: FloatArray
+    actions: FloatArray
+    rewards: FloatArray
+    terminated: BoolArray
+    truncated: BoolArray
+    extras: Mapping[str, npt.NDArray[Any]] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        steps = len(self.actions)
+        ranks = {"observations": 2, "actions": 2, "rewards": 1, "terminated": 1, "truncated": 1}
+        for name, rank in ranks.items():
+            array = getattr(self, name)
+            if array.ndim != rank:
+                raise TrajectoryError(f"{name} must have {rank} dimensions, got shape {array.shape}")
+        if len(self.observations) != steps + 1:
+            raise TrajectoryError(
+                f"observations must hold one row more than actions: {len(self.observations)} for {steps}"
+            )
+        for name in ("rewards", "terminated", "truncated"):
+            if len(getattr(self, name)) != steps:
+                raise TrajectoryError(f"{name} has {len(getattr(self, name))} steps, actions have {steps}")
+        for name, array in self.extras.items():
+            if array.shape != (steps,):
+                raise TrajectoryError(f"{name} has shape {array.shape}, expected ({steps},)")
+
+    def __len__(self) -> int:
+        return len(self.actions)
+
+    @property
+    def undiscounted_return(self) -> float:
+        """Sum of the rewards, computed in double precision."""
+        return float(np.sum(self.rewards, dtype=np.float64))
+
+
+ObservationView = Literal["stored", "full"]
 """`stored`: the observations in the dataset. `full`: with the values that datasets hide, such as the goal."""
 
 
 @dataclass(frozen=True)
-class Transition:
+class LaneTransition:
     """One step of all lanes, with observations in the controller's view.
 
     Rows of inactive lanes repeat the last observation and have reward zero.
@@ -44,7 +106,7 @@ class Controller(abc.ABC):
     A controller with state serves one rollout, which is one episode in every lane.
     """
 
-    view: View = "stored"
+    view: ObservationView = "stored"
     """Which observations the controller receives."""
 
     def draw_noise(self, generator: np.random.Generator, num_steps: int, action_dim: int) -> FloatArray:
@@ -55,7 +117,7 @@ class Controller(abc.ABC):
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         """Actions (lanes, action_dim) for observations (lanes, observation_dim) and this step's noise."""
 
-    def observe(self, transition: Transition) -> None:
+    def observe(self, transition: LaneTransition) -> None:
         """Receives every step after it is executed; does nothing by default.
 
         For controllers that adapt within an episode. `tcmrl_data.Recorder` turns transitions into
@@ -100,7 +162,7 @@ class _Wrapper(Controller):
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         return self._controller.act(observations, noise)
 
-    def observe(self, transition: Transition) -> None:
+    def observe(self, transition: LaneTransition) -> None:
         self._controller.observe(transition)
 
 

@@ -5,7 +5,7 @@ from typing import Any, Literal, NoReturn, final
 import numpy as np
 from pydantic import Field, model_validator
 
-from tcmrl_data.envs.base import Environment, EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.base import Environment, EnvironmentSettings, ObservationView, Parameters, Reward
 from tcmrl_data.foundation.errors import SimulationError
 
 
@@ -63,7 +63,9 @@ class Foreign(Environment):
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         _refuse()
 
-    def make(self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored") -> NoReturn:
+    def make(
+        self, parameters: Parameters, *, view: ObservationView = "stored", reward: Reward = "stored"
+    ) -> NoReturn:
         _refuse()
 
 

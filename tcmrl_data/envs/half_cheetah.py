@@ -19,9 +19,9 @@ from typing import Any, ClassVar, final
 import numpy as np
 from pydantic import Field, model_validator
 
-from tcmrl_data.envs.base import EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.base import EnvironmentSettings, ObservationView, Parameters, Reward
+from tcmrl_data.envs.controller import FloatArray
 from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, squared_norm
-from tcmrl_data.envs.trajectory import FloatArray
 
 DIRECTIONS = (-1.0, 1.0)
 
@@ -67,7 +67,7 @@ class _HalfCheetah(SimulatedEnvironment):
     settings: HalfCheetahVelSettings | HalfCheetahDirSettings
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
+        self, parameters: Parameters, *, view: ObservationView = "stored", reward: Reward = "stored"
     ) -> "HalfCheetahTask":
         return HalfCheetahTask(self, parameters)
 

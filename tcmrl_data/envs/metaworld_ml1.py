@@ -15,9 +15,9 @@ from typing import Any, ClassVar, final
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.envs.base import Controller, EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.base import Controller, EnvironmentSettings, ObservationView, Parameters, Reward
+from tcmrl_data.envs.controller import FloatArray
 from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, Viewpoint
-from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import TaskError
 
 GOAL = slice(-3, None)
@@ -77,7 +77,7 @@ class MetaWorldML1(SimulatedEnvironment):
         ]
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
+        self, parameters: Parameters, *, view: ObservationView = "stored", reward: Reward = "stored"
     ) -> "MetaWorldML1Task":
         if parameters["env_name"] != self._env_name:
             raise TaskError(
@@ -114,7 +114,7 @@ def _random_vectors(env_name: str, task_seed: int) -> tuple[tuple[float, ...], .
 class MetaWorldML1Task(SimulatedTask):
     """One goal of a task set."""
 
-    def __init__(self, environment: MetaWorldML1, parameters: Parameters, *, view: View) -> None:
+    def __init__(self, environment: MetaWorldML1, parameters: Parameters, *, view: ObservationView) -> None:
         from metaworld.types import Task
 
         # made without Meta-World's benchmark object, which is slow; the goal is hidden in `observe`
@@ -148,7 +148,7 @@ class ExpertController(Controller):
         noise: standard deviation of the noise (published data: 0.1).
     """
 
-    view: View = "full"
+    view: ObservationView = "full"
 
     def __init__(self, env_names: Sequence[str], noise: float) -> None:
         from metaworld.policies import ENV_POLICY_MAP

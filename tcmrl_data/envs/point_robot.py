@@ -22,11 +22,11 @@ from tcmrl_data.envs.base import (
     FigureCamera,
     Lanes,
     LaneStep,
+    ObservationView,
     Parameters,
     Reward,
-    View,
 )
-from tcmrl_data.envs.trajectory import BoolArray, FloatArray
+from tcmrl_data.envs.controller import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -84,7 +84,7 @@ class _PointRobot(Environment):
         return {}
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
+        self, parameters: Parameters, *, view: ObservationView = "stored", reward: Reward = "stored"
     ) -> "PointRobotEnv":
         return PointRobotEnv(PointRobotLanes(self, [parameters], reward))
 

@@ -20,9 +20,9 @@ from typing import Any, ClassVar, Literal, final
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.envs.base import EnvironmentSettings, Parameters, Reward, View
+from tcmrl_data.envs.base import EnvironmentSettings, ObservationView, Parameters, Reward
+from tcmrl_data.envs.controller import FloatArray
 from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, squared_norm
-from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import TaskError
 
 ALIVE_BONUS = 1.0
@@ -72,7 +72,7 @@ class _RandParams(SimulatedEnvironment):
         return multipliers
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
+        self, parameters: Parameters, *, view: ObservationView = "stored", reward: Reward = "stored"
     ) -> "RandParamsTask":
         simulator = self.simulator()
         self._scale(simulator, parameters)

@@ -7,10 +7,8 @@ from typing import Any, final
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.envs.base import Environment, Lanes
-from tcmrl_data.envs.controller import Controller, Transition
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import BoolArray, FloatArray, Trajectory
+from tcmrl_data.envs.base import Environment, Lanes, Task
+from tcmrl_data.envs.controller import BoolArray, Controller, FloatArray, LaneTransition, Trajectory
 
 STEP_ARRAYS: Mapping[str, type[np.generic]] = {
     "actions": np.float32,
@@ -57,7 +55,7 @@ def roll_out(
         actions = np.clip(controller.act(seen, draws[:, t]), -1.0, 1.0).astype(np.float32)
         step = lanes.step(actions, active)
         next_stored = environment.stored_view(step.observations)
-        transition = Transition(
+        transition = LaneTransition(
             stored, actions, step.rewards, next_stored, step.terminated, step.truncated, active
         )
         extras = {name: step.extras[name].astype(kind) for name, kind in environment.extras.items()}
@@ -98,7 +96,7 @@ class Recorder:
     Example:
         >>> import numpy as np
         >>> zeros, active = np.zeros((2, 3)), np.array([True, True])
-        >>> step = Transition(zeros, zeros[:, :1], np.ones(2), zeros, ~active, ~active, active)
+        >>> step = LaneTransition(zeros, zeros[:, :1], np.ones(2), zeros, ~active, ~active, active)
         >>> recorder = Recorder()
         >>> recorder.record(step)
         >>> [len(trajectory) for trajectory in recorder.trajectories()]
@@ -111,7 +109,7 @@ class Recorder:
         self._extras: dict[str, list[npt.NDArray[Any]]] = {}
 
     def record(
-        self, transition: Transition, extras: Mapping[str, npt.NDArray[np.generic]] | None = None
+        self, transition: LaneTransition, extras: Mapping[str, npt.NDArray[np.generic]] | None = None
     ) -> None:
         """Adds a copy of one step; `extras` are arrays (lanes,) with the same names in every step."""
         if not self._observations:

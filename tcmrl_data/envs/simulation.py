@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 
 from tcmrl_data.envs.base import Camera, Environment, Parameters, Picture
-from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.envs.controller import FloatArray
 from tcmrl_data.foundation.errors import RenderingError
 
 OPEN_GL = ("egl", "osmesa")

@@ -18,8 +18,8 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.envs.tasks import Split, Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Split, Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.disk import (
     disk,
@@ -37,9 +37,8 @@ from tcmrl_data.foundation.errors import MissingPackageError, StorageError, Stor
 from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.foundation.plugins import Registry
 from tcmrl_data.interchange.reader import EPISODE_ARRAYS, FORMAT_VERSION
-from tcmrl_data.recipe.about import AND
-from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.tables import task_line
+from tcmrl_data.recipe.document import AND
+from tcmrl_data.store.tables import PartKey, task_line
 
 REMEDY = "nothing was exported; make room or choose an --out on another disk, then export again"
 FILE_BYTES = 2**16

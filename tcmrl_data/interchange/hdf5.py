@@ -25,7 +25,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.interchange.exporting import Format, episode_arrays, transitions
 from tcmrl_data.interchange.hdf5_file import Hdf5File
@@ -41,7 +41,7 @@ from tcmrl_data.interchange.reader import (
     stored_episode,
 )
 from tcmrl_data.interchange.robomimic import read_robomimic
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 Layout = Literal["tcmrl", "d4rl", "robomimic"]
 

@@ -30,8 +30,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.disk import disk, named_errors
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
@@ -49,8 +49,7 @@ from tcmrl_data.interchange.reader import (
     episodes_of_rows,
     require_file,
 )
-from tcmrl_data.store.keys import PartKey
-from tcmrl_data.store.tables import task_line
+from tcmrl_data.store.tables import PartKey, task_line
 
 Policy = Literal["sample", "deterministic"]
 

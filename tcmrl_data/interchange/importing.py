@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, digest
 from tcmrl_data.foundation.errors import StoreError, TaskError
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
@@ -22,11 +22,19 @@ from tcmrl_data.interchange.reader import READERS, Reader, ReadPart, Say, damage
 from tcmrl_data.operations.assembly import derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
-from tcmrl_data.recipe.recipe import Recipe, bound_recipe, check_licence, foreign_recipe
-from tcmrl_data.store.keys import MAIN_RUN, MAX_ARRAYS, MAX_INDEX, PartKey, check_plan
+from tcmrl_data.recipe.imported import bound_recipe, check_licence, foreign_recipe
+from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part import DATA_VERSION, STANDARD_ARRAYS, PartRecord
-from tcmrl_data.store.tables import parse_task_file, task_line
+from tcmrl_data.store.tables import (
+    MAIN_RUN,
+    MAX_ARRAYS,
+    MAX_INDEX,
+    PartKey,
+    check_plan,
+    parse_task_file,
+    task_line,
+)
 
 
 @dataclass(frozen=True)

@@ -33,9 +33,8 @@ from gymnasium.utils import RecordConstructorArgs
 
 from tcmrl_data.dataset.dataset import Dataset, TaskReferences
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.envs.base import make_environment
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Task, make_environment
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
@@ -54,8 +53,8 @@ from tcmrl_data.interchange.reader import (
     require_file,
     stored_episode,
 )
-from tcmrl_data.recipe.about import AND
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.recipe.document import AND
+from tcmrl_data.store.tables import PartKey
 
 if TYPE_CHECKING:
     from minari.data_collector import EpisodeBuffer

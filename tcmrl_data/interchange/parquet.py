@@ -30,8 +30,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.disk import named_errors
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.interchange.exporting import REMEDY, Format, transitions
@@ -48,7 +48,7 @@ from tcmrl_data.interchange.reader import (
     require_file,
     stored_episode,
 )
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 if TYPE_CHECKING:
     import pyarrow

@@ -11,8 +11,8 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.spaces import Box
 
-from tcmrl_data.envs.tasks import Split, Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Split, Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
@@ -20,12 +20,12 @@ from tcmrl_data.interchange.reader import EpisodeCuts, episode_of
 from tcmrl_data.operations.assembly import derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
-from tcmrl_data.recipe.recipe import bound_recipe, check_licence, foreign_recipe
+from tcmrl_data.recipe.imported import bound_recipe, check_licence, foreign_recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
-from tcmrl_data.store.keys import MAIN_RUN, PartKey, key_of_file, part_folder
 from tcmrl_data.store.manifest import Manifest, Run
 from tcmrl_data.store.part import DATA_VERSION, STANDARD_ARRAYS, PartRecord
+from tcmrl_data.store.tables import MAIN_RUN, PartKey, key_of_file, part_folder
 
 
 @final

@@ -27,8 +27,8 @@ import h5py
 import numpy as np
 
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.interchange.exporting import Format, episode_arrays
 from tcmrl_data.interchange.hdf5_file import Hdf5File
@@ -40,7 +40,7 @@ from tcmrl_data.interchange.reader import (
     parts_of_task,
     stored_episode,
 )
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 OBSERVATION_KEY = "flat"
 STEP_ATTRIBUTE = "step"

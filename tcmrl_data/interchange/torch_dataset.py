@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Dataset
 
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.interchange.exporting import episode_arrays
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.selection import Selection

@@ -13,8 +13,8 @@ from tcmrl_data.operations.planning import check_parts, keys_of_run, simulated_r
 from tcmrl_data.parts.making import OWN_OPERATIONS
 from tcmrl_data.parts.operation import OPERATIONS
 from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
-from tcmrl_data.store.keys import MAIN_RUN, PartKey
 from tcmrl_data.store.manifest import FOREIGN_KINDS, Derivation, Manifest, Run
+from tcmrl_data.store.tables import MAIN_RUN, PartKey
 
 
 def apply_operation(

@@ -9,7 +9,7 @@ from typing import Any
 
 from tcmrl_data.building.work_files import ASSEMBLY, check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.envs.tasks import Split, Task
+from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.disk import (
     LOCK,
@@ -26,7 +26,6 @@ from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.foundation.records import sealed, write_ranges
 from tcmrl_data.parts.making import Published, numbered, publish
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
-from tcmrl_data.store.keys import MAX_PARTS, MAX_PLATFORMS, MAX_RUNS, PartKey, part_file
 from tcmrl_data.store.manifest import (
     Derivation,
     Manifest,
@@ -38,10 +37,17 @@ from tcmrl_data.store.manifest import (
     write_dataset,
     write_manifest,
 )
-from tcmrl_data.store.part import PartRecord
+from tcmrl_data.store.part import PartRecord, Platform
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, PartTable, part_line
-from tcmrl_data.store.platform import Platform
-from tcmrl_data.store.tables import TableWriter, read_sealed
+from tcmrl_data.store.tables import (
+    MAX_PARTS,
+    MAX_PLATFORMS,
+    MAX_RUNS,
+    PartKey,
+    TableWriter,
+    part_file,
+    read_sealed,
+)
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.dataset.selection import MEDIUM_SCORE, medium_scores
-from tcmrl_data.dataset.view_file import VIEW_SCHEMA, ViewedParts, is_view_file
-from tcmrl_data.envs.tasks import Split
+from tcmrl_data.dataset.selection import MEDIUM_SCORE, VIEW_SCHEMA, ViewedParts, is_view_file, medium_scores
+from tcmrl_data.envs.base import Split
 from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.disk import LOCK, lock_file, replace_file
 from tcmrl_data.foundation.errors import SelectionError, StoreError, TierError
@@ -16,7 +15,6 @@ from tcmrl_data.foundation.records import hidden_text, sealed, write_ranges
 from tcmrl_data.operations.assembly import check_out
 from tcmrl_data.operations.planning import Plan, Progress, carry_out
 from tcmrl_data.operations.subset import Choice, plan_subset
-from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import (
     MANIFEST,
     Derivation,
@@ -26,6 +24,7 @@ from tcmrl_data.store.manifest import (
     totals_of,
     write_manifest,
 )
+from tcmrl_data.store.tables import PartKey
 
 TOLERANCE = 15.0
 """A medium snapshot whose score is further from 33 than this is hardly medium: 18 to 48 are near."""

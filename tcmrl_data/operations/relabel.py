@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import BuildError, SelectionError
 from tcmrl_data.operations.apply import make_of_parts
 from tcmrl_data.operations.assembly import check_out, derivation_of
@@ -24,8 +24,8 @@ from tcmrl_data.parts.making import wanted_from
 from tcmrl_data.parts.operation import Simulator, Sources, StoredPart
 from tcmrl_data.parts.playback import RELABEL, first_episode_of
 from tcmrl_data.parts.worker import DeriveSpec
-from tcmrl_data.store.keys import MAIN_RUN, MAX_RUNS
 from tcmrl_data.store.manifest import Run
+from tcmrl_data.store.tables import MAIN_RUN, MAX_RUNS
 
 
 @dataclass(frozen=True)

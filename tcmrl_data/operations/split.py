@@ -5,7 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.envs.tasks import Split, in_order
+from tcmrl_data.envs.base import Split, in_order
 from tcmrl_data.foundation.errors import ManifestError, SelectionError
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
 from tcmrl_data.operations.assembly import check_out, derivation_of

@@ -10,14 +10,14 @@ import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.selection import MEDIUM_SCORE, task_scores
-from tcmrl_data.envs.tasks import Split, Task
+from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator
 from tcmrl_data.operations.assembly import derivation_of
 from tcmrl_data.operations.planning import Plan, PlannedPart, settle_runs
 from tcmrl_data.parts.stored import SUBSET, Cut
-from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part import STANDARD_ARRAYS
+from tcmrl_data.store.tables import PartKey
 
 MAX_RECORDED_TASKS = 5_000
 """Scores of more tasks are not recorded, so that the manifest stays small; `task_scores` gives them."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from pydantic import ValidationError
 
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
@@ -22,22 +22,23 @@ from tcmrl_data.parts.stored import Cut, Import
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
-from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part import (
     DATA_VERSION,
     PART_SCHEMA,
     RECORD,
+    UNKNOWN,
     ArrayRecord,
     Identity,
     PartRecord,
+    Platform,
     References,
     Statistics,
     check_members,
     read_part_record,
 )
 from tcmrl_data.store.part_table import PartEntry, part_entry
-from tcmrl_data.store.platform import UNKNOWN, Platform
+from tcmrl_data.store.tables import PartKey, part_file
 
 NO_REFERENCES = References(uniform=None, oracle=None, scripted=None)
 """Where nobody has measured any."""

@@ -18,18 +18,16 @@ from pydantic import BaseModel
 
 from tcmrl_data.behavior.snapshot import Snapshot, read_snapshot
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.envs.base import Environment, Lanes
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.base import Environment, Lanes, Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.errors import BuildError, RenderingError, StoreError, TrajectoryError
 from tcmrl_data.foundation.plugins import Registry
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
-from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.manifest import FOREIGN_KINDS, Run, RunKind
-from tcmrl_data.store.part import DATA_VERSION, PartRecord
-from tcmrl_data.store.platform import Platform, this_platform
+from tcmrl_data.store.part import DATA_VERSION, PartRecord, Platform, this_platform
+from tcmrl_data.store.tables import PartKey
 
 OperationSettings = TypeVar("OperationSettings", bound=BaseModel)
 

@@ -7,16 +7,15 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field
 
-from tcmrl_data.envs.controller import PlaybackController
+from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import PlaybackController, Trajectory
 from tcmrl_data.envs.rollout import roll_out
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import SimulationError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.parts.operation import Operation, Sources, WantedPart
-from tcmrl_data.store.keys import MAX_INDEX
 from tcmrl_data.store.manifest import Run
+from tcmrl_data.store.tables import MAX_INDEX
 
 RELABEL = "relabel"
 

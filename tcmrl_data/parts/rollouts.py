@@ -7,17 +7,16 @@ import numpy as np
 from pydantic import Field
 
 from tcmrl_data.behavior.snapshot import Snapshot
-from tcmrl_data.envs.controller import Controller, NoisyController, UniformController
+from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import Controller, NoisyController, Trajectory, UniformController
 from tcmrl_data.envs.rollout import roll_out
-from tcmrl_data.envs.tasks import Task
-from tcmrl_data.envs.trajectory import Trajectory
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 from tcmrl_data.parts.operation import Operation, Simulator, Sources, WantedPart, check_finite
-from tcmrl_data.store.keys import MAX_INDEX
 from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part import PartRecord, References
+from tcmrl_data.store.tables import MAX_INDEX
 
 EXTEND = "extend"
 MAX_NOISE = 10.0

@@ -3,14 +3,14 @@
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar, final
 
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.errors import BuildError, SelectionError
 from tcmrl_data.foundation.records import Record, count_ranges, read_ranges, write_ranges
 from tcmrl_data.parts.operation import Operation, Sources, WantedPart
 from tcmrl_data.parts.playback import RELABEL, first_episode_of
-from tcmrl_data.store.keys import MAX_COUNT
 from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part import STANDARD_ARRAYS, Identity, PartRecord
+from tcmrl_data.store.tables import MAX_COUNT
 
 SUBSET = "subset"
 """Operation of parts that lack episodes or arrays of another, and of datasets that lack parts."""

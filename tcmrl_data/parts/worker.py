@@ -25,9 +25,9 @@ from tcmrl_data.parts.making import (
 )
 from tcmrl_data.parts.operation import Operation, Simulator, StoredPart
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.store.keys import PartKey
 from tcmrl_data.store.part import References
 from tcmrl_data.store.part_table import REFERENCES
+from tcmrl_data.store.tables import PartKey
 
 WORKER = "tcmrl_data.parts.worker"
 UNITS_PER_WORKER = 4

@@ -15,9 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.dataset.picture import new_figure, save_figure
-from tcmrl_data.envs.tasks import Split, Task
-from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.envs.base import Split, Task
+from tcmrl_data.envs.controller import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import evenly_spread
@@ -35,12 +34,14 @@ from tcmrl_data.quality.measured import (
     filled_parts,
     heading,
     label_axes,
+    new_figure,
     sampled_parts,
+    save_figure,
     steps_by_task,
     title,
 )
 from tcmrl_data.quality.scores import trajectory_quality
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 CELL = 0.5
 """Default width of a cell in standard deviations."""

@@ -6,20 +6,22 @@ A number of a record is None where it is not defined: a score without reference 
 import itertools
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.envs.tasks import Split, Task
-from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.envs.base import Split, Task
+from tcmrl_data.envs.controller import FloatArray
 from tcmrl_data.foundation.errors import SelectionError, StoreError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import evenly_spread
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 SAMPLED_PARTS = 100
 """Parts, evenly spread over the dataset, from which scales and ranges of values are taken."""
@@ -186,3 +188,39 @@ def draw_matrix(axes: "Axes", rows: Sequence[Sequence[float]], tasks: Sequence[i
     axes.set_xticks(places, names, rotation=90, fontsize="small")
     axes.set_yticks(places, names, fontsize="small")
     axes.figure.colorbar(image, ax=axes, label=label)
+
+
+PLOT_FORMATS = (".pdf", ".png", ".svg")
+DOTS_PER_INCH = 130
+
+
+def check_picture(file: Path) -> None:
+    """Checks the name of a picture before the work that it shows.
+
+    Raises:
+        SelectionError: the ending names no supported format, or the folder does not exist.
+    """
+    if file.suffix.lower() not in PLOT_FORMATS:
+        raise SelectionError(f"--plot {file}: the name must end in {', '.join(PLOT_FORMATS)}")
+    if not file.parent.is_dir():
+        raise SelectionError(f"--plot {file}: {file.parent} is not a folder; make it first")
+
+
+def new_figure(width: float, height: float) -> "Figure":
+    """An empty figure of so many inches, which opens no window."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def save_figure(figure: "Figure", file: Path) -> None:
+    """Writes a figure; the ending of the name is its format.
+
+    Raises:
+        SelectionError: as `check_picture` does.
+    """
+    check_picture(file)
+    figure.savefig(file, dpi=DOTS_PER_INCH)

@@ -8,9 +8,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.dataset.picture import new_figure, save_figure
-from tcmrl_data.envs.tasks import Split
-from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.envs.base import Split
+from tcmrl_data.envs.controller import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.quality.measured import (
     COLORS,
@@ -23,11 +22,13 @@ from tcmrl_data.quality.measured import (
     by_stage,
     heading,
     label_axes,
+    new_figure,
     sampled_parts,
+    save_figure,
     steps_by_task,
     title,
 )
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 BINS = 40
 """Default number of bins."""

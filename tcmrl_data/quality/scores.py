@@ -2,15 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.dataset.picture import new_figure, save_figure
+from tcmrl_data.dataset.listing import SPLITS, summarize_returns
 from tcmrl_data.dataset.selection import TIERS, Tier, task_scores, tier_parts
-from tcmrl_data.envs.tasks import Split, Task
+from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.quality.measured import (
@@ -22,11 +22,14 @@ from tcmrl_data.quality.measured import (
     MeasuredStage,
     MeasuredTask,
     by_stage,
+    check_picture,
     heading,
     label_axes,
+    new_figure,
+    save_figure,
     title,
 )
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -214,3 +217,54 @@ def _draw_split(axes: "Axes", found: Quality, split: Split) -> None:
     if all(tq.low is not None for tq in spreads):
         ends = ([tq.low for tq in spreads], [tq.high for tq in spreads])
         axes.fill_between(steps, *ends, color=COLORS[split], alpha=0.25, linewidth=0)
+
+
+def plot_returns(dataset: Dataset, table: dict[str, Any], file: Path) -> None:
+    """Draws the learning curves of all tasks, train and test apart, with oracle and uniform actions.
+
+    Args:
+        dataset: where the references come from.
+        table: what `list_returns` made.
+        file: the picture to write; its ending names the format.
+
+    Raises:
+        SelectionError: the file's name is none of a picture, or the dataset has no parts.
+    """
+    check_picture(file)
+    if not any(task["snapshots"] for task in table["tasks"]):
+        raise SelectionError(f"{dataset.folder} has no parts to plot; build it with `tcmrl-data build`")
+    figure = new_figure(7.0, 4.2)
+    axes = figure.subplots()
+    for split, color in zip(SPLITS, ("tab:blue", "tab:orange"), strict=True):
+        _draw_returns(axes, table, split, color)
+    _draw_references(axes, dataset)
+    axes.set(xlabel="environment steps of behavior training", ylabel="mean undiscounted return")
+    axes.set_title(f"{dataset.name}: behavior policies of {len(table['tasks'])} tasks")
+    axes.grid(alpha=0.3)
+    axes.legend(fontsize="small")
+    save_figure(figure, file)
+
+
+def _draw_returns(axes: "Axes", table: dict[str, Any], split: str, color: str) -> None:
+    tasks = [task for task in table["tasks"] if task["split"] == split and task["snapshots"]]
+    for task in tasks:
+        steps = [found["step"] for found in task["snapshots"]]
+        axes.plot(
+            steps, [found["mean"] for found in task["snapshots"]], color=color, alpha=0.35, linewidth=0.9
+        )
+    rows = [row for row in summarize_returns(table) if row["split"] == split]
+    if rows:
+        label = f"{split}, mean of {len(tasks)} tasks"
+        axes.plot(
+            [row["step"] for row in rows], [row["mean"] for row in rows], "o-", color=color, label=label
+        )
+
+
+def _draw_references(axes: "Axes", dataset: Dataset) -> None:
+    references = [dataset.references(task.index) for task in dataset.tasks if not dataset.missing(task.index)]
+    for name, line in (("oracle", "--"), ("uniform", ":")):
+        values = [value for record in references if (value := getattr(record, name)) is not None]
+        if values:
+            axes.axhline(
+                float(np.mean(values)), color="0.3", linestyle=line, label=f"{name}, mean of all tasks"
+            )

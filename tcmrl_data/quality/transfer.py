@@ -7,19 +7,25 @@ from pathlib import Path
 import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.dataset.picture import new_figure, save_figure
-from tcmrl_data.dataset.returns import SPLITS
+from tcmrl_data.dataset.listing import SPLITS
 from tcmrl_data.dataset.selection import chosen_parts
-from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.controller import BelievingController, Controller, DeterministicController
+from tcmrl_data.envs.base import Environment, Split, Task, in_order
+from tcmrl_data.envs.controller import BelievingController, Controller, DeterministicController, FloatArray
 from tcmrl_data.envs.rollout import first_observation, hidden_entries, roll_out
-from tcmrl_data.envs.tasks import Split, Task, in_order
-from tcmrl_data.envs.trajectory import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, evenly_spread, keyed_generator, keyed_seed
 from tcmrl_data.parts.worker import one_thread
-from tcmrl_data.quality.measured import TQ_LABEL, Measured, MeasuredTask, draw_matrix, heading, title
-from tcmrl_data.store.keys import MAIN_RUN, PartKey
+from tcmrl_data.quality.measured import (
+    TQ_LABEL,
+    Measured,
+    MeasuredTask,
+    draw_matrix,
+    heading,
+    new_figure,
+    save_figure,
+    title,
+)
+from tcmrl_data.store.tables import MAIN_RUN, PartKey
 
 EPISODES = 5
 """Episodes of a policy in a task by default."""

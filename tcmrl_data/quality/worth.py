@@ -24,10 +24,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.dataset.picture import new_figure, save_figure
-from tcmrl_data.dataset.returns import SPLITS
-from tcmrl_data.envs.tasks import Split
-from tcmrl_data.envs.trajectory import FloatArray
+from tcmrl_data.dataset.listing import SPLITS
+from tcmrl_data.envs.base import Split
+from tcmrl_data.envs.controller import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
@@ -41,7 +40,9 @@ from tcmrl_data.quality.measured import (
     by_stage,
     heading,
     label_axes,
+    new_figure,
     read_steps,
+    save_figure,
     title,
 )
 from tcmrl_data.quality.scores import bootstrap_interval

@@ -1,21 +1,36 @@
-"""Recipes: TOML files, resolved once into a validated, frozen configuration."""
+"""Recipes: TOML files, resolved once into a validated, frozen configuration, and the tasks they choose."""
 
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES, BehaviorSource
-from tcmrl_data.envs.base import ENVIRONMENTS, Environment, Reward, TaskSplit, make_environment
-from tcmrl_data.envs.controller import View
-from tcmrl_data.envs.foreign import Foreign
-from tcmrl_data.foundation.errors import RecipeError, TcmrlError
+from tcmrl_data.envs.base import (
+    ENVIRONMENTS,
+    Environment,
+    Reward,
+    Task,
+    TaskSplit,
+    draw_tasks,
+    in_order,
+    make_environment,
+)
+from tcmrl_data.envs.controller import ObservationView
+from tcmrl_data.foundation.errors import RecipeError, TaskError, TcmrlError
 from tcmrl_data.foundation.records import as_model, missing_fields, validate_table
-from tcmrl_data.recipe.about import About, licence_problem, read_about
-from tcmrl_data.recipe.document import merge_tables, open_recipe, read_override
-from tcmrl_data.recipe.profile import Profile
+from tcmrl_data.recipe import Profile
+from tcmrl_data.recipe.document import (
+    About,
+    merge_tables,
+    open_recipe,
+    read_about,
+    read_override,
+)
 
 
 class _Table(BaseModel):
@@ -106,7 +121,7 @@ class BehaviorTable(_Table):
     """
 
     source: str
-    observation: View = "stored"
+    observation: ObservationView = "stored"
     reward: Reward = "stored"
     settings: dict[str, Any]
 
@@ -248,7 +263,7 @@ class _Behavior(_Table):
     """The `[behavior]` table of a recipe file, without the tables of sources."""
 
     source: str = "stacked"
-    observation: View = "stored"
+    observation: ObservationView = "stored"
     reward: Reward = "stored"
 
 
@@ -259,85 +274,88 @@ def _behavior(
     plain = {key: value for key, value in tables.items() if not isinstance(value, Mapping)}
     own = validate_table(_Behavior, plain, place=place, error=RecipeError, table="behavior")
     kind = BEHAVIOR_SOURCES.get(own.source)
-    if not isinstance(tables.get(own.source), Mapping):
-        raise RecipeError(f"{place}: behavior source {own.source!r} has no [behavior.{own.source}] table")
-    extended = tables.get(kind.extends or own.source, {})
-    return own, kind, merge_tables(extended if isinstance(extended, Mapping) else {}, tables[own.source])
+    given: dict[str, Any] = {}
+    for name in (kind.extends or own.source, own.source):
+        given = merge_tables(given, tables[name]) if isinstance(tables.get(name), Mapping) else given
+    return own, kind, given
 
 
-UNKNOWN = "unknown"
-UNKNOWN_BEHAVIOR = BehaviorTable(source=UNKNOWN, settings={})
-"""Behavior of imported episodes, whose policies are not described; no behavior source has this name."""
+def spread(tasks: Sequence[Task], *, num_train: int, num_test: int, is_circular: bool = False) -> list[int]:
+    """Indices, ascending, of `num_train` training and `num_test` test tasks, evenly spaced in their split.
 
-
-def foreign_recipe(
-    *,
-    tasks: int,
-    train: int,
-    horizon: int,
-    observation_dim: int,
-    action_dim: int,
-    extra_arrays: Mapping[str, str],
-    licence: str | None,
-) -> Recipe:
-    """The recipe of imported data whose environment is unknown; arguments as in `ForeignSettings`.
-
-    Every manifest has a recipe, in which samplers, exports, `inspect` and training find sizes, horizon and
-    training tables. `licence` is None if it is unknown.
-    """
-    environment = {
-        "name": Foreign.name,
-        "task_seed": 0,
-        "tasks": tasks,
-        "train": train,
-        "horizon": horizon,
-        "reward_density": "dense",
-        "observation_dim": observation_dim,
-        "action_dim": action_dim,
-        "extra_arrays": dict(extra_arrays),
-    }
-    return Recipe(
-        profile="paper",
-        about=About(
-            description="data of an environment that is not known here",
-            citation=UNKNOWN,
-            licence=licence or UNKNOWN,
-        ),
-        environment=EnvironmentTable.model_validate(environment),
-        behavior=UNKNOWN_BEHAVIOR,
-        rollouts=NoRollouts(),
-        build=TaskChoice(),
-        training={"paper": {}},
-    )
-
-
-def bound_recipe(environment: str, *, licence: str | None) -> Recipe:
-    """The recipe of imported data of an installed environment; `licence` is None if it is unknown.
+    Tasks are given in the order in which they are spaced. A selection contains the first and the last task of
+    a split, so that it covers the same range; on a circle, where these are neighbors, only the first.
 
     Raises:
-        UnknownNameError: there is no such environment.
+        TaskError: a split has fewer tasks.
     """
-    recipe = load_recipe(environment)
-    return recipe.model_copy(
-        update={
-            "about": recipe.about.model_copy(
-                update={
-                    "citation": UNKNOWN,
-                    "licence": licence or UNKNOWN,
-                    "authors": (),
-                    "url": None,
-                    "doi": None,
-                }
-            ),
-            "behavior": UNKNOWN_BEHAVIOR,
-            "rollouts": NoRollouts(),
-            "build": TaskChoice(),
-        }
-    )
+    chosen: list[int] = []
+    for split, number in (("train", num_train), ("test", num_test)):
+        members = [task.index for task in tasks if task.split == split]
+        if number > len(members):
+            raise TaskError(f"{number} {split} tasks asked for, the task set has {len(members)}")
+        last = len(members) if is_circular else len(members) - 1
+        positions = np.linspace(0, last, number, endpoint=not is_circular).round().astype(int)
+        chosen.extend(members[position] for position in positions)
+    return sorted(chosen)
 
 
-def check_licence(licence: str | None) -> None:
-    """Raises `RecipeError` if SPDX does not know the licence given for imported data."""
-    problem = None if licence is None else licence_problem(licence)
-    if problem:
-        raise RecipeError(f"licence: {problem}")
+def choose_tasks(
+    recipe: Recipe, indices: Sequence[int] | None = None, *, environment: Environment | None = None
+) -> list[Task]:
+    """The tasks with the given indices, or else those of the recipe's profile, ascending.
+
+    A profile's tasks are evenly spaced along the environment's ordering, or by index if it has none.
+
+    Args:
+        recipe: the recipe.
+        indices: of the tasks; None for the profile's choice.
+        environment: the recipe's, if it was made before.
+
+    Raises:
+        TaskError: an index does not exist, or the profile has more tasks than the task set.
+    """
+    environment = environment or recipe.make_environment()
+    tasks = draw_tasks(environment)
+    if indices is None:
+        num_train, num_test = (
+            sum(task.split == split for task in tasks) if wanted is None else wanted
+            for split, wanted in (("train", recipe.build.train_tasks), ("test", recipe.build.test_tasks))
+        )
+        indices = spread(
+            in_order(environment, tasks),
+            num_train=num_train,
+            num_test=num_test,
+            is_circular=environment.is_circular,
+        )
+    for index in indices:
+        if not 0 <= index < len(tasks):
+            raise TaskError(f"task index {index} does not exist, the tasks are 0-{len(tasks) - 1}")
+    return [tasks[index] for index in sorted(set(indices))]
+
+
+def group_tasks(tasks: Iterable[Task], group_size: int) -> list[tuple[Task, ...]]:
+    """Groups of the tasks with equal index // group_size, ascending; the machine does not affect them."""
+    ordered = sorted(tasks, key=lambda task: task.index)
+    return [tuple(group) for _, group in groupby(ordered, key=lambda task: task.index // group_size)]
+
+
+def parse_indices(text: str, num_tasks: int, *, option: str = "--tasks") -> list[int]:
+    """The sorted indices in a text such as `0-9,12`.
+
+    Raises:
+        TaskError: the text is not a list of indices and ranges, or an index does not exist; the message
+            names the option.
+    """
+    indices: set[int] = set()
+    for item in text.split(","):
+        first, dash, last = item.strip().partition("-")
+        if not first.isdecimal() or (dash and not last.isdecimal()):
+            raise TaskError(f"{option} {text!r}: {item!r} is neither an index nor a range such as 0-9")
+        start, stop = int(first), int(last or first)
+        if stop < start:
+            raise TaskError(f"{option} {text!r}: the range {item!r} runs backwards")
+        if stop >= num_tasks:
+            raise TaskError(f"{option} {text!r}: {stop} is too large, 0-{num_tasks - 1} are possible")
+        indices.update(range(start, stop + 1))
+    return sorted(indices)

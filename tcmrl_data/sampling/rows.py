@@ -12,7 +12,7 @@ from tcmrl_data.envs.base import DENSE_REWARDS, Reward
 from tcmrl_data.foundation.errors import SelectionError, StoreError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.store.arrays import Arrays, array_digests, checked_offsets
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.dataset import Dataset

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from tcmrl_data.envs.trajectory import Trajectory
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import canonical_json, parse_json, sha256
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line

@@ -11,16 +11,18 @@ from typing import Annotated, Any, Literal
 
 from pydantic import FailFast, Field, field_validator, model_validator
 
-from tcmrl_data.envs.tasks import Split, Task
+from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file, words_after
 from tcmrl_data.foundation.records import Record, parse_record, read_ranges, sealed
-from tcmrl_data.recipe.about import AND, joined_licences
-from tcmrl_data.recipe.profile import Profile
+from tcmrl_data.recipe import Profile
+from tcmrl_data.recipe.document import AND, joined_licences
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.store.keys import (
+from tcmrl_data.store.part import Platform
+from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartTable, part_line
+from tcmrl_data.store.tables import (
     MAX_COUNT,
     MAX_INDEX,
     MAX_PARTS,
@@ -29,10 +31,11 @@ from tcmrl_data.store.keys import (
     MAX_TASKS,
     RUN_NAME,
     SHA256,
+    TASKS,
+    TableSeal,
+    seal_of,
+    task_line,
 )
-from tcmrl_data.store.part_table import HEADER, PARTS_TABLE, PartTable, part_line
-from tcmrl_data.store.platform import Platform
-from tcmrl_data.store.tables import TASKS, TableSeal, seal_of, task_line
 
 MANIFEST_SCHEMA = 2
 """Raised when the meaning or the layout of a dataset's files changes."""

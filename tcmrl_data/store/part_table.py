@@ -18,9 +18,8 @@ from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.records import first_problem
-from tcmrl_data.store.keys import MAX_COUNT, MAX_INDEX, MAX_PLATFORMS, RUN_NAME, SHA256, PartKey
 from tcmrl_data.store.part import PartRecord
-from tcmrl_data.store.tables import blocks
+from tcmrl_data.store.tables import MAX_COUNT, MAX_INDEX, MAX_PLATFORMS, RUN_NAME, SHA256, PartKey, blocks
 
 PARTS_TABLE = "parts.jsonl"
 

@@ -28,8 +28,8 @@ from tcmrl_data.foundation.disk import (
     remove_tree,
 )
 from tcmrl_data.foundation.errors import BuildError, LockedError, StoreError
-from tcmrl_data.store.keys import PARTS, is_part_folder, key_of_file
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, dataset_folder, read_manifest
+from tcmrl_data.store.tables import PARTS, is_part_folder, key_of_file
 from tcmrl_data.verification.description import Scan, scan_dataset
 from tcmrl_data.verification.repair import REPAIR
 

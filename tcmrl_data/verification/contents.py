@@ -12,8 +12,7 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from tcmrl_data.behavior.snapshot import GaussianDescription, read_snapshot
-from tcmrl_data.envs.base import Environment
-from tcmrl_data.envs.tasks import Split, Task, draw_tasks
+from tcmrl_data.envs.base import Environment, Split, Task, draw_tasks
 from tcmrl_data.foundation.errors import ManifestError, SnapshotError, StoreError, TcmrlError, TrajectoryError
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem, words_after
 from tcmrl_data.foundation.records import first_problem
@@ -21,11 +20,10 @@ from tcmrl_data.parts.making import statistics
 from tcmrl_data.recipe.recipe import Recipe, same_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import array_digests, read_arrays, unpack
-from tcmrl_data.store.keys import MAX_TASKS
 from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part import POLICY, RECORD, STANDARD_ARRAYS, PartRecord, check_members, read_part_record
 from tcmrl_data.store.part_table import REFERENCES, STATISTICS, PartEntry
-from tcmrl_data.store.tables import TASKS
+from tcmrl_data.store.tables import MAX_TASKS, TASKS
 from tcmrl_data.verification.description import Description, VerifyLevel
 from tcmrl_data.verification.replay import origin_problem
 

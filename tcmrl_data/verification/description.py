@@ -8,13 +8,21 @@ from pathlib import Path
 from typing import Literal
 
 from tcmrl_data.building.work_files import WORK_FILES, WORK_FOLDERS
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.plain_files import one_line, status_of, words_after
-from tcmrl_data.store.keys import PARTS, PartKey, is_part_folder, key_of_file
 from tcmrl_data.store.manifest import MANIFEST, Manifest, is_complete, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_parts
-from tcmrl_data.store.tables import TASKS, TableSeal, parse_tasks, read_sealed
+from tcmrl_data.store.tables import (
+    PARTS,
+    TASKS,
+    PartKey,
+    TableSeal,
+    is_part_folder,
+    key_of_file,
+    parse_tasks,
+    read_sealed,
+)
 
 VerifyLevel = Literal["quick", "digests", "deep"]
 

@@ -33,7 +33,6 @@ from tcmrl_data.parts.making import Published, numbered, operation_of_run, read_
 from tcmrl_data.parts.operation import can_be_made_again
 from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
-from tcmrl_data.store.keys import MAIN_RUN, PartKey, part_file
 from tcmrl_data.store.manifest import (
     MANIFEST,
     MANIFEST_COPY,
@@ -42,9 +41,9 @@ from tcmrl_data.store.manifest import (
     read_manifest,
     restore_manifest,
 )
+from tcmrl_data.store.part import Platform, this_platform
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
-from tcmrl_data.store.platform import Platform, this_platform
-from tcmrl_data.store.tables import TASKS
+from tcmrl_data.store.tables import MAIN_RUN, TASKS, PartKey, part_file
 from tcmrl_data.verification.description import Finding, VerifyLevel
 from tcmrl_data.verification.tables import restore_tables, write_tables
 from tcmrl_data.verification.verify import find_problems, verify_dataset

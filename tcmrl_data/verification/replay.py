@@ -32,11 +32,10 @@ from tcmrl_data.parts.worker import one_thread
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import DECODED_FLOOR, DECODED_RATIO, pack, read_arrays
-from tcmrl_data.store.keys import PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST, Derivation, Run
 from tcmrl_data.store.part import PartRecord, read_part_record
 from tcmrl_data.store.part_table import PartTable
-from tcmrl_data.store.tables import TASKS
+from tcmrl_data.store.tables import TASKS, PartKey, part_file
 
 FIRST_STEPS = 5
 STEP_TOLERANCE = 1e-3

@@ -6,16 +6,23 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
-from tcmrl_data.envs.tasks import Task, draw_tasks
+from tcmrl_data.envs.base import Task, draw_tasks
 from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.parts.making import Published, numbered, read_published
-from tcmrl_data.recipe.tasks import choose_tasks
-from tcmrl_data.store.keys import PartKey, key_of_file, part_file
+from tcmrl_data.recipe.recipe import choose_tasks
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, Manifest, write_dataset
+from tcmrl_data.store.part import Platform
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_entries, parse_parts
-from tcmrl_data.store.platform import Platform
-from tcmrl_data.store.tables import TASKS, parse_tasks, read_lines, read_sealed
+from tcmrl_data.store.tables import (
+    TASKS,
+    PartKey,
+    key_of_file,
+    parse_tasks,
+    part_file,
+    read_lines,
+    read_sealed,
+)
 from tcmrl_data.verification.contents import recipe_environment
 from tcmrl_data.verification.description import scan_dataset
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tcmrl_data.building.work_files import DESCRIPTIONS
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.dataset.view_file import is_view_file
+from tcmrl_data.dataset.selection import is_view_file
 from tcmrl_data.foundation.disk import LOCK, lock_holder
 from tcmrl_data.foundation.errors import ManifestError, StoreError
 from tcmrl_data.foundation.machine import available_cores
@@ -22,7 +22,6 @@ from tcmrl_data.foundation.plain_files import file_problem, words_after
 from tcmrl_data.foundation.seeding import evenly_spread
 from tcmrl_data.parts.operation import can_be_made_again
 from tcmrl_data.store.archive import Archive
-from tcmrl_data.store.keys import PARTS, key_of_file, part_file
 from tcmrl_data.store.manifest import (
     MANIFEST,
     MANIFEST_COPY,
@@ -33,7 +32,7 @@ from tcmrl_data.store.manifest import (
 )
 from tcmrl_data.store.part import read_part_record
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry
-from tcmrl_data.store.tables import TASKS
+from tcmrl_data.store.tables import PARTS, TASKS, key_of_file, part_file
 from tcmrl_data.verification.contents import PartChecks, task_problems
 from tcmrl_data.verification.description import (
     NO_PART,

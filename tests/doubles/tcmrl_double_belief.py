@@ -17,7 +17,7 @@ from tcmrl_algo import (
     pad_trajectories,
 )
 from tcmrl_algo.algorithms.core.networks import linear
-from tcmrl_data import Batch, BatchRequest, Controller, Steps, Trajectories, Trajectory, Transition
+from tcmrl_data import Batch, BatchRequest, Controller, LaneTransition, Steps, Trajectories, Trajectory
 
 BELIEF = 4
 
@@ -69,7 +69,7 @@ class BeliefController(FunctionController):
         super().__init__(lambda states: learner.act(states, self._belief), learner.problem.device)
         self._learner, self._belief = learner, belief
 
-    def observe(self, transition: Transition) -> None:
+    def observe(self, transition: LaneTransition) -> None:
         names = ("observations", "actions", "rewards")
         values = [torch.as_tensor(getattr(transition, name)).float() for name in names]
         with torch.no_grad():

@@ -19,7 +19,6 @@ from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays, read_arrays
-from tcmrl_data.store.keys import PARTS, PartKey, part_file
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part import RECORD
 from tcmrl_data.store.part_table import (
@@ -31,7 +30,7 @@ from tcmrl_data.store.part_table import (
     parse_parts,
     part_line,
 )
-from tcmrl_data.store.tables import TASKS, seal_of, task_line
+from tcmrl_data.store.tables import PARTS, TASKS, PartKey, part_file, seal_of, task_line
 
 FORGED_TASKS, STEP = (0, 3), 150
 PART = part_file(PartKey(0, STEP))

@@ -14,9 +14,9 @@ from tcmrl_data.envs.base import (
     EnvironmentSettings,
     FigureCamera,
     FloatArray,
+    ObservationView,
     Parameters,
     Reward,
-    View,
 )
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Pendulum(Environment):
         return [dict(zip(NOMINAL, (row * list(NOMINAL.values())).tolist(), strict=True)) for row in factors]
 
     def make(
-        self, parameters: Parameters, *, view: View = "stored", reward: Reward = "stored"
+        self, parameters: Parameters, *, view: ObservationView = "stored", reward: Reward = "stored"
     ) -> gymnasium.Env[Any, Any]:
         from gymnasium.envs.classic_control.pendulum import PendulumEnv
         from gymnasium.wrappers import RescaleAction, TimeLimit

@@ -20,9 +20,9 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.envs.tasks import Task
+from tcmrl_data.envs.base import Task
 from tcmrl_data.interchange.exporting import Format, transitions
-from tcmrl_data.store.keys import PartKey
+from tcmrl_data.store.tables import PartKey
 
 
 @final

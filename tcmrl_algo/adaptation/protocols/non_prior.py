@@ -8,7 +8,7 @@ import numpy as np
 
 from tcmrl_algo.adaptation.arena import Arena, FloatArray
 from tcmrl_algo.adaptation.protocols.base import Adaptation, Protocol
-from tcmrl_data import Controller, Task, Trajectory, Transition
+from tcmrl_data import Controller, LaneTransition, Task, Trajectory
 
 
 @final
@@ -75,6 +75,6 @@ class UniformStart(Controller):
     def act(self, observations: FloatArray, noise: FloatArray) -> FloatArray:
         return noise if self._done < self._steps else self._controller.act(observations, noise)
 
-    def observe(self, transition: Transition) -> None:
+    def observe(self, transition: LaneTransition) -> None:
         self._done += 1
         self._controller.observe(transition)
