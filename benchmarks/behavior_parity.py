@@ -28,7 +28,7 @@ from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.envs.base import Task
 from tcmrl_data.parts.operation import Simulator
-from tcmrl_data.parts.rollouts import act
+from tcmrl_data.parts.own_operations import act
 from tcmrl_data.recipe.recipe import choose_tasks
 
 CHECKPOINTS = 5

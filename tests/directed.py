@@ -95,7 +95,7 @@ class Directions:
             time.sleep(0.005)
 
 
-def _work(spec: dict[str, Any], report: Report) -> str:
+def work(spec: dict[str, Any], report: Report) -> str:
     directions = Directions(**spec.pop("directions"))
     left = directions.passes
 
@@ -122,9 +122,3 @@ def run_directed(main: Callable[[], object], directions: Directions) -> None:
     """Runs a command line whose units get directions."""
     directions.install(pytest.MonkeyPatch())
     main()
-
-
-if __name__ == "__main__":
-    from tcmrl_data.engine.worker import serve
-
-    serve(_work)

@@ -185,7 +185,7 @@ def test_a_worker_loads_torchs_compiler_only_if_it_compiles() -> None:
         "    doubled = torch.compile(lambda tensor: 2 * tensor, backend='eager')(torch.ones(2))\n"
         "    return f'{is_left_out} {doubled.tolist()}'\n"
         "import sys\n"
-        "serve(work)\n"
+        "serve(__name__)\n"
     )
     with subprocess.Popen(
         [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True

@@ -10,9 +10,9 @@ from tcmrl_data import Dataset, merge_datasets, open_dataset, repair_dataset, ve
 from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.errors import BuildError, SelectionError
 from tcmrl_data.operations.apply import apply_operation
-from tcmrl_data.parts.making import OWN_OPERATIONS, make_from, operation_named, operation_of
+from tcmrl_data.parts.making import make_from
 from tcmrl_data.parts.operation import OPERATIONS, Operation, Simulator, Sources, StoredPart, WantedPart
-from tcmrl_data.parts.stored import Import
+from tcmrl_data.parts.own_operations import OWN_OPERATIONS, Import, operation_named, operation_of
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.part import read_part_record
 from tcmrl_data.store.tables import PartKey

@@ -157,7 +157,7 @@ def test_a_unit_runs_once_on_every_machine_that_could_run_it(
     assert [(list(report.messages), report.error) for report in reports] == [(expected, None)] * 2
     failed = engine.run_on_every_node(dataclasses.replace(unit, worker="tcmrl_data.nothing"))
     ray_cluster.remove_node(small)
-    assert all("No module named tcmrl_data.nothing" in str(report.error) for report in failed)
+    assert all("No module named 'tcmrl_data.nothing'" in str(report.error) for report in failed)
 
 
 @loopback

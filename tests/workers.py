@@ -25,9 +25,9 @@ def worker_pids(mark: str) -> list[int]:
 
 
 def _module(pid: int) -> bytes:
-    """The module that `python -m` started the process with."""
-    _, _, module = (*_read(pid, "cmdline").split(b"\0"), b"", b"", b"")[:3]
-    return module
+    """The module whose work a worker process does; empty for any other process."""
+    _, _, entry, module = (*_read(pid, "cmdline").split(b"\0"), b"", b"", b"", b"")[:4]
+    return module if entry == b"tcmrl_data.engine.worker" else b""
 
 
 def marked_pids(mark: str) -> list[int]:

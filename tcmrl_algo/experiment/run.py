@@ -38,7 +38,7 @@ from tcmrl_algo.training.config import stage_plan
 from tcmrl_algo.training.train import TrainingProgress, resume_run, train_run, usable_device
 from tcmrl_data import CheckpointError, Dataset, TrainingError, open_dataset
 from tcmrl_data.engine.base import BaseEngine, Unit, make_engine
-from tcmrl_data.engine.worker import Send, serve
+from tcmrl_data.engine.worker import Send
 from tcmrl_data.foundation.disk import lock_file, make_folders, replace_file
 from tcmrl_data.foundation.errors import DivergenceError
 from tcmrl_data.foundation.machine import available_cores, processor
@@ -437,7 +437,3 @@ def work(spec: dict[str, Any], report: Send) -> str:
     except DivergenceError as error:
         replace_file(error_file(Path(job.folder)), f"{error}\n".encode())
         return DIVERGED
-
-
-if __name__ == "__main__":
-    serve(work)

@@ -16,7 +16,7 @@ from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.unit import PartMaker, UnitSpec
 from tcmrl_data.engine.base import ENGINES, Unit
-from tcmrl_data.engine.worker import Send, serve
+from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.machine import available_cores
@@ -320,7 +320,3 @@ def _measure_parts(spec: UnitSpec, plan: BuildPlan, task: Task, snapshot: Snapsh
         maker.close()
     stretch = plan.environment.settings.horizon * found.episodes / max(1, found.steps)
     return {"first_part": seconds[0], "part": seconds[1], "stretch": stretch}
-
-
-if __name__ == "__main__":
-    serve(work)

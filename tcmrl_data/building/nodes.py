@@ -9,7 +9,7 @@ from typing import Any
 
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.engine.base import BaseEngine, NodeReport, Unit
-from tcmrl_data.engine.worker import Send, serve
+from tcmrl_data.engine.worker import Send
 from tcmrl_data.foundation.disk import STAGING, make_folders, write_file
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.locks import wait_until_visible
@@ -149,7 +149,3 @@ def _own_platform(recipe: dict[str, Any]) -> dict[str, Any]:
     resolved = as_model(Recipe, recipe)
     platform = this_platform(resolved.make_environment(), resolved.behavior.source)
     return platform.model_dump(mode="json")
-
-
-if __name__ == "__main__":
-    serve(work)

@@ -1,7 +1,4 @@
-"""What one worker does: train a unit's behavior policies, roll them out, publish the parts. Idempotent.
-
-The process of a unit is `python -m tcmrl_data.building.unit`, with a JSON spec on its input.
-"""
+"""What one worker does: train a unit's behavior policies, roll them out, publish the parts. Idempotent."""
 
 import contextlib
 from collections.abc import Mapping, Sequence
@@ -13,14 +10,14 @@ from tcmrl_data.behavior.base import CHECKPOINT_SECONDS, BehaviorContext, Behavi
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.work_files import checkpoint_name
-from tcmrl_data.engine.worker import Send, serve
+from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.errors import NondeterminismError
 from tcmrl_data.foundation.records import as_model
-from tcmrl_data.parts.making import Published, make_part, publish, read_published
+from tcmrl_data.parts.making import Published, make_part, one_thread, publish, read_published
 from tcmrl_data.parts.operation import Simulator, Sources, WantedPart
-from tcmrl_data.parts.rollouts import Rollout, measure_references
+from tcmrl_data.parts.own_operations import Rollout, measure_references
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.part import DATA_VERSION, PartRecord, References, read_part_record
@@ -213,11 +210,5 @@ def _checkpoints(
 
 def work(spec: dict[str, Any], report: Send) -> str:
     """Makes and publishes the parts of a unit; the digest of their ids."""
-    import torch
-
-    torch.set_num_threads(1)  # digests depend on it: reductions split by thread round differently
-    return run_unit(UnitSpec.from_json(spec), report)
-
-
-if __name__ == "__main__":
-    serve(work)
+    with one_thread():
+        return run_unit(UnitSpec.from_json(spec), report)

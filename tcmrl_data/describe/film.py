@@ -21,7 +21,7 @@ from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.simulation import check_chosen_open_gl
 from tcmrl_data.foundation.errors import RenderingError, SelectionError, SimulationError
 from tcmrl_data.foundation.seeding import Purpose, evenly_spread, keyed_seed
-from tcmrl_data.parts.making import operation_of
+from tcmrl_data.parts.own_operations import operation_of
 from tcmrl_data.store.tables import PartKey
 
 

@@ -22,7 +22,7 @@ class Unit:
     Attributes:
         id: name of the unit in messages and logs.
         spec: JSON values that the worker reads.
-        worker: module that the process runs; it passes its `work` to `tcmrl_data.engine.worker.serve`.
+        worker: module whose `work` the process calls, see `tcmrl_data.engine.worker`.
         threads: threads of the process's numerical libraries.
         cost: relative duration; the longest unit starts first.
         cpus: cores to reserve, on engines that use several machines.

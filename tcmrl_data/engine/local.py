@@ -121,7 +121,7 @@ def run_attempt(
 
 def _start_worker(unit: Unit, errors: IO[str]) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [sys.executable, "-m", unit.worker],
+        [sys.executable, "-m", "tcmrl_data.engine.worker", unit.worker],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=errors,

@@ -1,11 +1,12 @@
-"""The worker process of a unit: reads a JSON spec from standard input, writes messages to standard output.
+"""The worker process of a unit, `python -m tcmrl_data.engine.worker MODULE`, whatever the unit is.
 
-A module becomes a worker by calling `serve`; engines run it as `python -m <module>`. Messages are JSON lines;
-the last one is `{"kind": "result", "digest" | "error"}`. The process ends when standard input closes, so that
-no worker outlives a killed driver. On SIGTERM or SIGINT it abandons the unit: a behavior training first
-writes its checkpoint, published parts stay, staged files are removed.
+It reads a JSON spec from standard input, calls the module's `work` and writes messages to standard output as
+JSON lines; the last one is `{"kind": "result", "digest" | "error"}`. The process ends when standard input
+closes, so that no worker outlives a killed driver. On SIGTERM or SIGINT it abandons the unit: a behavior
+training first writes its checkpoint, published parts stay, staged files are removed.
 """
 
+import importlib
 import json
 import os
 import signal
@@ -62,16 +63,17 @@ def _abandon(signal_number: int, frame: FrameType | None) -> None:
     raise SystemExit(128 + signal_number)
 
 
-def serve(work: Callable[[dict[str, Any], Send], str]) -> None:
+def serve(module: str) -> None:
     """Runs the unit whose spec is the first line of standard input, reports its result and ends the process.
 
     Args:
-        work: takes a spec and a receiver of messages, and returns the digest of the work done. A `TcmrlError`
-            that it raises becomes the unit's error; the unit is not tried again.
+        module: its `work` takes a spec and a receiver of messages, and returns the digest of the work done. A
+            `TcmrlError` that it raises becomes the unit's error; the unit is not tried again.
     """
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, _abandon)
     leave_out_compiler()
+    work = importlib.import_module(module).work
     spec = json.loads(sys.stdin.readline())
     threading.Thread(target=_end_with_the_driver, daemon=True).start()
     report = _Reporter()
@@ -81,3 +83,7 @@ def serve(work: Callable[[dict[str, Any], Send], str]) -> None:
         report({"kind": "result", "error": str(error)})
     sys.stderr.flush()
     os._exit(0)  # skips the shutdown of libraries, which takes a second
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1])

@@ -10,9 +10,9 @@ from tcmrl_data.foundation.records import validate_table
 from tcmrl_data.operations.assembly import derivation_of, open_assembly
 from tcmrl_data.operations.derive import check_label
 from tcmrl_data.operations.planning import check_parts, keys_of_run, simulated_run
-from tcmrl_data.parts.making import OWN_OPERATIONS
+from tcmrl_data.parts.jobs import DeriveSpec, Job, derive_parts
 from tcmrl_data.parts.operation import OPERATIONS
-from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
+from tcmrl_data.parts.own_operations import OWN_OPERATIONS
 from tcmrl_data.store.manifest import FOREIGN_KINDS, Derivation, Manifest, Run
 from tcmrl_data.store.tables import MAIN_RUN, PartKey
 

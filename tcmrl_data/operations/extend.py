@@ -19,9 +19,9 @@ from tcmrl_data.operations.planning import (
     runs_of_pairs,
     simulated_run,
 )
+from tcmrl_data.parts.jobs import DeriveSpec, Job, derive_parts
 from tcmrl_data.parts.making import Published
-from tcmrl_data.parts.rollouts import EXTEND, MAX_NOISE
-from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
+from tcmrl_data.parts.own_operations import EXTEND, MAX_NOISE
 from tcmrl_data.recipe.recipe import Rollouts
 from tcmrl_data.store.manifest import Run, read_manifest
 from tcmrl_data.store.tables import MAIN_RUN, PartKey

@@ -11,9 +11,10 @@ from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import BuildError, NondeterminismError, SelectionError
 from tcmrl_data.operations.assembly import Copied, open_assembly
-from tcmrl_data.parts.making import make_from, operation_of_run
+from tcmrl_data.parts.jobs import Job
+from tcmrl_data.parts.making import make_from
 from tcmrl_data.parts.operation import Operation, StoredPart, can_be_made_again
-from tcmrl_data.parts.worker import Job
+from tcmrl_data.parts.own_operations import operation_of_run
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.manifest import Derivation, Manifest, Run
 from tcmrl_data.store.part import PartRecord, this_platform

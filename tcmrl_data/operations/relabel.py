@@ -20,10 +20,10 @@ from tcmrl_data.operations.planning import (
     runs_of_pairs,
     simulated_run,
 )
+from tcmrl_data.parts.jobs import DeriveSpec
 from tcmrl_data.parts.making import wanted_from
 from tcmrl_data.parts.operation import Simulator, Sources, StoredPart
-from tcmrl_data.parts.playback import RELABEL, first_episode_of
-from tcmrl_data.parts.worker import DeriveSpec
+from tcmrl_data.parts.own_operations import RELABEL, first_episode_of
 from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.tables import MAIN_RUN, MAX_RUNS
 

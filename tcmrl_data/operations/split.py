@@ -11,7 +11,7 @@ from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
 from tcmrl_data.operations.assembly import check_out, derivation_of
 from tcmrl_data.operations.derive import Derived, summary, write_view
 from tcmrl_data.operations.planning import Plan, PlannedPart, Progress, carry_out, settle_runs
-from tcmrl_data.parts.stored import Cut
+from tcmrl_data.parts.own_operations import Cut
 from tcmrl_data.store.manifest import read_manifest
 
 FOLD, EPISODES = "fold", "episodes"

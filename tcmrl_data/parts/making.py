@@ -1,28 +1,24 @@
 """Making and publishing a part, whatever its episodes come from."""
 
+import contextlib
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import ValidationError
 
 from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
-from tcmrl_data.foundation.records import as_model, first_problem
-from tcmrl_data.parts.operation import OPERATIONS, Operation, Simulator, Sources, StoredPart, WantedPart
-from tcmrl_data.parts.playback import Relabel
-from tcmrl_data.parts.rollouts import Extend, Rollout
-from tcmrl_data.parts.stored import Cut, Import
+from tcmrl_data.foundation.records import as_model
+from tcmrl_data.parts.operation import Operation, Simulator, Sources, StoredPart, WantedPart
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays, pack
-from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part import (
     DATA_VERSION,
     PART_SCHEMA,
@@ -43,49 +39,7 @@ from tcmrl_data.store.tables import PartKey, part_file
 NO_REFERENCES = References(uniform=None, oracle=None, scripted=None)
 """Where nobody has measured any."""
 
-OWN_OPERATIONS: Mapping[str, type[Operation[Any]]] = {
-    operation.name: operation for operation in (Rollout, Cut, Extend, Relabel, Import)
-}
-"""Known without their entry points, which building would have to load."""
-
 QUANTILES = (0.0, 0.1, 0.25, 0.5, 0.75, 0.9, 1.0)
-
-
-def operation_named(name: str) -> type[Operation[Any]]:
-    """The operation of a name, of this package or of another.
-
-    Raises:
-        UnknownNameError: no installed package declares it.
-        PluginError: the package that declares it is broken.
-    """
-    return OWN_OPERATIONS.get(name) or OPERATIONS.get(name)
-
-
-def operation_of_run(run: Run) -> type[Operation[Any]]:
-    """The operation that makes the parts of a run; errors as of `operation_named`."""
-    own = next((operation for operation in OWN_OPERATIONS.values() if run.kind in operation.kinds), None)
-    return own or operation_named(str((run.origin or {}).get("operation")))
-
-
-def operation_of(identity: Identity, place: str) -> Operation[Any]:
-    """The operation that makes a part.
-
-    Args:
-        identity: of the part.
-        place: of the part, for messages.
-
-    Raises:
-        ManifestError: its settings are not valid; names the place and the field.
-        UnknownNameError: no installed package has the operation.
-    """
-    derived = identity.derived
-    if derived is None:
-        return Import() if identity.seed is None or identity.policy is None else Rollout()
-    kind = operation_named(str(derived.get("operation"))[:64])
-    try:
-        return kind(as_model(kind.Settings, derived.get("settings")))
-    except ValidationError as error:
-        raise ManifestError(f"{place}: identity.derived.settings: {first_problem(error)}") from None
 
 
 def make_part(
@@ -298,6 +252,19 @@ def _is_wanted(identity: Identity, wanted: WantedPart) -> bool:
     found = (identity.derived, identity.policy, identity.seed, identity.parameters)
     asked = (wanted.derived, policy, wanted.seed, wanted.task.parameters)
     return found == asked and same_settings(identity.settings, wanted.settings)
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """One torch thread: digests depend on it, since reductions split by thread round differently."""
+    import torch
+
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 def numbered(parts: Iterable[Published], platforms: list[Platform]) -> list[PartEntry]:

@@ -14,7 +14,7 @@ from tcmrl_data.envs.controller import BelievingController, Controller, Determin
 from tcmrl_data.envs.rollout import first_observation, hidden_entries, roll_out
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, evenly_spread, keyed_generator, keyed_seed
-from tcmrl_data.parts.worker import one_thread
+from tcmrl_data.parts.making import one_thread
 from tcmrl_data.quality.measured import (
     TQ_LABEL,
     Measured,

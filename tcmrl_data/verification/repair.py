@@ -29,9 +29,10 @@ from tcmrl_data.foundation.errors import (
     StoreError,
 )
 from tcmrl_data.foundation.plain_files import folder_problem, read_plain_file
-from tcmrl_data.parts.making import Published, numbered, operation_of_run, read_published
+from tcmrl_data.parts.jobs import DeriveSpec, Job, derive_parts
+from tcmrl_data.parts.making import Published, numbered, read_published
 from tcmrl_data.parts.operation import can_be_made_again
-from tcmrl_data.parts.worker import DeriveSpec, Job, derive_parts
+from tcmrl_data.parts.own_operations import operation_of_run
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.manifest import (
     MANIFEST,

@@ -17,7 +17,7 @@ from tcmrl_data.operations.merge import MERGE, plan_merge
 from tcmrl_data.operations.planning import Plan, PlannedPart
 from tcmrl_data.operations.split import EPISODES, FOLD, plan_episodes, plan_fold
 from tcmrl_data.operations.subset import Choice, plan_subset
-from tcmrl_data.parts.making import operation_of
+from tcmrl_data.parts.making import one_thread
 from tcmrl_data.parts.operation import (
     MissingSourceError,
     Operation,
@@ -27,8 +27,7 @@ from tcmrl_data.parts.operation import (
     WantedPart,
     can_be_made_again,
 )
-from tcmrl_data.parts.stored import SUBSET, read_cut
-from tcmrl_data.parts.worker import one_thread
+from tcmrl_data.parts.own_operations import SUBSET, operation_of, read_cut
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import DECODED_FLOOR, DECODED_RATIO, pack, read_arrays

@@ -1,35 +1,29 @@
-"""Parts made from stored ones in worker processes: `python -m tcmrl_data.parts.worker`."""
+"""Parts made from stored ones in worker processes."""
 
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.engine.base import ENGINES, Unit
-from tcmrl_data.engine.worker import Send, serve
+from tcmrl_data.engine.worker import Send
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.records import as_model
-from tcmrl_data.parts.making import (
-    NO_REFERENCES,
-    Published,
-    make_from,
-    operation_named,
-    publish,
-    wanted_from,
-)
+from tcmrl_data.parts.making import NO_REFERENCES, Published, make_from, one_thread, publish, wanted_from
 from tcmrl_data.parts.operation import Operation, Simulator, StoredPart
+from tcmrl_data.parts.own_operations import operation_named
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.part import References
 from tcmrl_data.store.part_table import REFERENCES
 from tcmrl_data.store.tables import PartKey
 
-WORKER = "tcmrl_data.parts.worker"
+WORKER = "tcmrl_data.parts.jobs"
 UNITS_PER_WORKER = 4
 """Starting a process takes seconds, a part often less; few units balance well enough."""
 
@@ -200,24 +194,7 @@ def references_of(dataset: Dataset, task: int) -> References:
     return References(**{name: getattr(entries[0], name) for name in REFERENCES})
 
 
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """One torch thread: digests depend on it, since reductions split by thread round differently."""
-    import torch
-
-    threads = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
-
-
 def work(values: dict[str, Any], report: Send) -> str:
     """Makes and publishes the parts of some jobs; the digest of their ids."""
     with one_thread():
         return publish_jobs(DeriveSpec.from_json(values), report)
-
-
-if __name__ == "__main__":
-    serve(work)
