@@ -264,7 +264,7 @@ def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
 def test_a_worker_ends_with_its_driver(long_recipe: Recipe, tmp_path: Path) -> None:
     """It ends when its input closes, long before its unit is done."""
     (unit,) = make_units(long_recipe, tmp_path / "data", [40])
-    command = [sys.executable, "-m", WORKER]
+    command = [sys.executable, "-m", "tcmrl_data.engine.worker", WORKER]
     worker = subprocess.run(
         command, cwd=ROOT, text=True, input=json.dumps(unit.spec) + "\n", capture_output=True, check=False
     )
