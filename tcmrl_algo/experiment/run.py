@@ -1,6 +1,6 @@
 """Runs an experiment: skips finished runs, resumes killed ones, several at once, and writes one table.
 
-A run is a process: `python -m tcmrl_algo.experiment.run`, a JSON job on standard input. It trains up to the
+A run is a worker process, which gets a JSON job on standard input. It trains up to the
 next point of the learning curve, evaluates there, writes the point down, and so on; a killed one goes on from
 the newest checkpoint and ends in the same tensors.
 """
