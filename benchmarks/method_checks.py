@@ -38,8 +38,8 @@ from tcmrl_algo.algorithms.borel import BorelLearner, joined_episodes
 from tcmrl_algo.algorithms.csro import CsroLearner
 from tcmrl_algo.algorithms.macaw import MacawLearner
 from tcmrl_algo.algorithms.unicorn import UnicornLearner
-from tcmrl_algo.reporting.contexts import NUM_TASKS, centroid_accuracy
-from tcmrl_algo.reporting.sources import read_sources
+from tcmrl_algo.report.contexts import NUM_TASKS, centroid_accuracy
+from tcmrl_algo.report.sources import read_sources
 from tcmrl_algo.training.checkpoint import RunRecord, open_run
 from tcmrl_algo.training.config import method_of
 from tcmrl_data import Dataset, Steps, Task, Trajectory

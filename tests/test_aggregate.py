@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tcmrl_algo import Summary, summarize
-from tcmrl_algo.experiment.aggregate import holm, mean_interval, sign_probability
+from tcmrl_algo.report.statistics import holm, mean_interval, sign_probability
 from tcmrl_data import TrainingError
 
 

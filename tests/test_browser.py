@@ -6,9 +6,7 @@ from pathlib import Path
 import pytest
 
 import tcmrl_data
-from tcmrl_algo.reporting.compose import compose
-from tcmrl_algo.reporting.html import page_html
-from tcmrl_algo.reporting.write import measure_paths
+from tcmrl_algo.report.write import compose, measure_paths, page_html
 from tests.chromium import Chromium, chromium_or_skip, running_chromium
 from tests.experiments import made_report
 

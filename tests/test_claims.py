@@ -4,10 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from tcmrl_algo.experiment.results import ContextMeasures, RunResult, coverage
+from tcmrl_algo.experiment.results import ContextMeasures, RunResult
 from tcmrl_algo.experiment.spec import Claim, Experiment, read_experiment
-from tcmrl_algo.reporting.claims import Verdict, compare, correct, judge, measure
-from tcmrl_algo.reporting.sources import Source
+from tcmrl_algo.report.statistics import Verdict, compare, correct, coverage, judge, measure
 from tcmrl_data import TcmrlError
 from tests import experiments
 from tests.experiments import made_result, with_setting
@@ -99,12 +98,12 @@ def test_contexts_are_compared_by_what_a_report_measured() -> None:
     assert measure(made_result("A"), "context_ratio", None) is None
 
 
-def _source(claims: list[dict[str, object]], results: list[RunResult]) -> Source:
+def _source(claims: list[dict[str, object]], results: list[RunResult]) -> tuple[Experiment, list[RunResult]]:
     content = experiments.tables(Path("nowhere"), claims=claims)
     content["protocols"] = ["offline", "paper", "idaq"]
     content["methods"] = {"A": {"algorithm": "tcmrl"}, "B": {"algorithm": "focal"}}
     experiment: Experiment = read_experiment(content, place="test")
-    return Source(experiment, tuple(results))
+    return experiment, results
 
 
 def test_a_claim_is_judged_under_every_protocol_unless_it_names_some() -> None:
@@ -113,7 +112,7 @@ def test_a_claim_is_judged_under_every_protocol_unless_it_names_some() -> None:
     source = _source(
         [claim, claim | {"protocols": ["idaq"]}, claim | {"metric": "training_seconds"}], results
     )
-    assert [verdict.protocol for verdict in judge(source)] == ["offline", "paper", "idaq", "idaq", None]
+    assert [verdict.protocol for verdict in judge(*source)] == ["offline", "paper", "idaq", "idaq", None]
 
 
 def test_a_registered_test_is_not_corrected_and_corrects_no_other() -> None:
@@ -125,7 +124,7 @@ def test_a_registered_test_is_not_corrected_and_corrects_no_other() -> None:
     ]
     claim = {"text": "", "better": "A", "worse": "B", "protocols": ["offline", "paper"]}
     others = [claim | {"metric": metric} for metric in ("normalized", "shuffled")]
-    verdicts = judge(_source([claim | {"registered": "point-robot"}, *others], results))
+    verdicts = judge(*_source([claim | {"registered": "point-robot"}, *others], results))
     first, *rest = verdicts
     assert (first.protocol, first.is_registered, first.verdict) == ("offline", True, "supported")
     assert first.adjusted == first.probability == pytest.approx(0.01324, abs=1e-5)
@@ -145,11 +144,11 @@ def test_verdicts_are_corrected_for_their_number() -> None:
         for method, final in (("A", seed + 1.0), ("B", 0.0))
     ]
     claim = {"text": "A beats B", "better": "A", "worse": "B"}
-    (single,) = judge(_source([claim | {"protocols": ["paper"]}], results))
+    (single,) = judge(*_source([claim | {"protocols": ["paper"]}], results))
     assert single.adjusted == single.probability == pytest.approx(0.01324, abs=1e-5)
     assert single.verdict == "supported"
-    three = judge(_source([claim], results))
+    three = judge(*_source([claim], results))
     assert [verdict.adjusted for verdict in three] == [pytest.approx(3 * 0.013236, abs=1e-5)] * 3
-    four = judge(_source([claim, claim | {"metric": "normalized"}], results))
+    four = judge(*_source([claim, claim | {"metric": "normalized"}], results))
     assert {verdict.verdict for verdict in three} == {"supported"}
     assert {verdict.verdict for verdict in four} == {"cannot tell"}

@@ -12,7 +12,6 @@ from tcmrl_cli.frame import number as shown
 from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import write_results_page
-from tcmrl_algo.experiment.aggregate import mean_interval
 from tcmrl_algo.experiment.results import (
     ContextMeasures,
     CurvePoint,
@@ -21,9 +20,8 @@ from tcmrl_algo.experiment.results import (
     read_table,
     write_table,
 )
-from tcmrl_algo.reporting.results_page import PAGE, TEMPLATE, Numbers, number, page_of, read_numbers
-from tcmrl_algo.reporting.returns import DatasetReturns, SnapshotReturns
-from tcmrl_algo.reporting.rows import (
+from tcmrl_algo.report.results_page import PAGE, TEMPLATE, Numbers, number, page_of, read_numbers
+from tcmrl_algo.report.rows import (
     CURVES,
     RUNS,
     WORTH,
@@ -34,6 +32,8 @@ from tcmrl_algo.reporting.rows import (
     run_rows,
     settings_digest,
 )
+from tcmrl_algo.report.sources import DatasetReturns, SnapshotReturns
+from tcmrl_algo.report.statistics import mean_interval
 from tcmrl_data import CheckpointError, TrainingError
 from tests import experiments
 from tests.commands import assert_refused, in_process

@@ -5,9 +5,9 @@ from pathlib import Path
 
 from tcmrl_algo.experiment.results import RunResult, success_rate
 from tcmrl_algo.experiment.spec import run_id
-from tcmrl_algo.reporting.scores import over_dataset
-from tcmrl_algo.reporting.sections import final_table, published_table
-from tcmrl_algo.reporting.sources import read_sources
+from tcmrl_algo.report.sources import read_sources
+from tcmrl_algo.report.statistics import over_dataset
+from tcmrl_algo.report.tables import final_table, published_table
 from tests import experiments
 from tests.experiments import made_result, write_results
 
@@ -15,7 +15,7 @@ from tests.experiments import made_result, write_results
 def test_missing_runs_are_counted_by_method_or_environment_and_failed_ones_named(tmp_path: Path) -> None:
     content = experiments.tables(tmp_path, claims=[], methods={"A": {"algorithm": "tcmrl"}}, seeds=[0])
     folder = write_results(tmp_path / "one", content, [made_result("A", 0, 1.0)])
-    (source,) = read_sources([folder], lambda stage, done, total: None)
+    (source,) = read_sources([folder], None)
     runs = [("point-robot", "B", 1), ("point-robot", "B", 2), ("ml1/reach", "A", 0), ("ml1/reach", "B", 0)]
     unfinished = {run_id(*run): None for run in runs} | {run_id("point-robot", "A", 1): "diverged"}
     assert replace(source, unfinished=unfinished).missing == [

@@ -216,7 +216,8 @@ def plan_runs(
             tuned=found(environment, label),
         )
         for environment, dataset in datasets.items()
-        for label in experiment.methods
+        for label, method in experiment.methods.items()
+        if method.runs_in(environment)
     }
     splits = {
         environment: fold_datasets(dataset, out / "folds", experiment.folds)
@@ -251,6 +252,7 @@ def plan_runs(
         for seed in (experiment.seeds if seeds is None else seeds)
         for fold, dataset in splits[environment].items()
         for label in experiment.methods
+        if (environment, label) in configs
     ]
 
 

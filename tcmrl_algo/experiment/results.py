@@ -303,36 +303,6 @@ def table_text(rows: Sequence[Mapping[str, Any]], columns: Sequence[str] = COLUM
     return stream.getvalue()
 
 
-def coverage(results: Sequence[RunResult]) -> str:
-    """What an interval over these runs covers, such as `5 seeds, 1 split, 4 test tasks`.
-
-    Runs without folds share one split of one dataset, so that an interval over them covers the training
-    alone. With folds every task is a test task in one of them: it covers training on these splits.
-    """
-    seeds, folds = {result.seed for result in results}, {result.fold for result in results}
-    tasks = {
-        (task["task"], result.environment)
-        for result in results
-        for evaluation in result.evaluations.values()
-        for task in evaluation["tasks"]
-    }
-    runs = _count(len(seeds), "seed")
-    if folds - {None}:
-        whole = len(results) % (len(seeds) * len(folds)) == 0
-        runs = f"{'' if whole else f'{len(results)} of '}{runs} × {_count(len(folds), 'fold')}"
-    else:
-        runs += ", 1 split"
-    return f"{runs}, {_count(len(tasks), 'test task')}" if results else "no run"
-
-
-def by_method(results: Iterable[RunResult]) -> dict[str, list[RunResult]]:
-    """Results of every method, in the order given, by its `label`."""
-    found: dict[str, list[RunResult]] = {}
-    for result in results:
-        found.setdefault(result.label, []).append(result)
-    return found
-
-
 def result_file(folder: Path) -> Path:
     """Where the result of the run in a folder is written, as its last deed."""
     return folder.with_name(f"{folder.name}.json")
@@ -368,10 +338,6 @@ def read_results(folder: Path, experiment: Experiment) -> list[RunResult]:
         return result.environment, order.index(result.method), fold, result.seed
 
     return sorted(known, key=place)
-
-
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
 def read_table(kind: type[Row], file: Path) -> list[Row]:

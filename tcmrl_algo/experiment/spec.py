@@ -67,10 +67,16 @@ class MethodChoice(_Table):
     Attributes:
         algorithm: a file of `tcmrl_algo/algorithms`.
         training: changes of the training table, after those of the experiment and the environment.
+        environments: in which the method is run; all of the experiment's where empty.
     """
 
     algorithm: str
     training: dict[str, Any] = {}
+    environments: tuple[str, ...] = ()
+
+    def runs_in(self, environment: str) -> bool:
+        """Whether the method is run there."""
+        return not self.environments or environment in self.environments
 
 
 class Claim(_Table):
@@ -134,6 +140,10 @@ class Experiment(_Table):
         for what, values in (("seeds", self.seeds), ("protocols", self.protocols), ("methods", folders)):
             if len(set(values)) < len(values) or "" in values:
                 raise ValueError(f"{what} must be distinct names or numbers, got {list(values)}")
+        for label, method in self.methods.items():
+            if unknown := set(method.environments) - set(self.environments):
+                known = ", ".join(self.environments)
+                raise ValueError(f"method {label!r} names no environment {min(unknown)!r}; they are {known}")
         if min(self.seeds) < 0:
             raise ValueError(f"seeds must not be negative, got {list(self.seeds)}")
         for claim in self.claims:

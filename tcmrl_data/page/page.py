@@ -74,9 +74,14 @@ def _data_url(content: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}"
 
 
+def allowed_text(text: str) -> str:
+    """The text, in which characters that HTML forbids are replaced by question marks."""
+    return _FORBIDDEN.sub("\N{REPLACEMENT CHARACTER}", text)
+
+
 def escaped(text: str) -> Markup:
-    """A text as HTML; characters that HTML forbids are replaced by question marks."""
-    return Markup.escape(_FORBIDDEN.sub("\N{REPLACEMENT CHARACTER}", text))
+    """A text as HTML, without characters that HTML forbids."""
+    return Markup.escape(allowed_text(text))
 
 
 def _finalized(value: Any) -> Any:

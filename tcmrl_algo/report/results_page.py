@@ -13,11 +13,11 @@ from typing import Any
 
 import jinja2
 
-from tcmrl_algo.experiment.aggregate import holm, mean_interval, sign_probability
 from tcmrl_algo.experiment.results import Row, read_table
 from tcmrl_algo.experiment.tunings import TABLE, TrialRow
-from tcmrl_algo.reporting.figures import draw_board, draw_method_curves
-from tcmrl_algo.reporting.rows import CURVES, WORTH, CurveRow, RunRow, WorthRow
+from tcmrl_algo.report.figures import draw_board, draw_method_curves
+from tcmrl_algo.report.rows import CURVES, WORTH, CurveRow, RunRow, WorthRow
+from tcmrl_algo.report.statistics import holm, mean_interval, sign_probability
 from tcmrl_data import TrainingError
 from tcmrl_data.foundation.disk import make_folders, replace_file
 

@@ -1,21 +1,71 @@
-"""Tables of a report, one per function; `write.py` orders them."""
+"""Tables of a report, as Markdown and as CSV, one function each; `write.py` orders them."""
 
 import importlib.resources
 import tomllib
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from tcmrl_algo.experiment.results import RunResult, by_method, coverage
-from tcmrl_algo.reporting.claims import Verdict
-from tcmrl_algo.reporting.returns import DatasetReturns
-from tcmrl_algo.reporting.scores import known_scores
-from tcmrl_algo.reporting.tables import Cell, Table, across_seeds, interval_text
+from tcmrl_algo.experiment.results import RunResult, table_text
+from tcmrl_algo.report.sources import DatasetReturns
+from tcmrl_algo.report.statistics import Verdict, by_method, coverage, known_scores, summarize
 
+Cell = str | float | int | None
 PAPER_COSTS = ("paper: training s", "paper: MB")
 PAPER_ATTENTION = ("paper: mean", "paper: median")
 IDAQ = ("IDAQ", "idaq_literal")
 """IDAQ trains as FOCAL does, and adapts by this protocol."""
 PARTS = ("final", "shuffled", "regret", "normalized", "fixed")
+
+
+@dataclass(frozen=True)
+class Table:
+    """A named table; None is a missing value.
+
+    Attributes:
+        name: name of the CSV file.
+        columns: headings.
+        rows: cells of the rows, one per column.
+    """
+
+    name: str
+    columns: tuple[str, ...]
+    rows: tuple[tuple[Cell, ...], ...]
+
+    def markdown(self) -> str:
+        """The table as Markdown, with four significant digits; columns of text are aligned left."""
+        cells = zip(*self.rows, strict=True) if self.rows else [()] * len(self.columns)
+        sides = [":---" if any(isinstance(cell, str) for cell in column) else "---:" for column in cells]
+        lines = [self.columns, tuple(sides), *self.rows]
+        return "\n".join(f"| {' | '.join(_text(cell) for cell in line)} |" for line in lines)
+
+    def csv(self) -> str:
+        """The table as CSV, with all digits."""
+        return table_text([dict(zip(self.columns, row, strict=True)) for row in self.rows], self.columns)
+
+
+def across_seeds(values: Sequence[float | None]) -> tuple[Cell, Cell, Cell]:
+    """Mean, interquartile mean, and interval as text, or the values of all seeds if they are too few."""
+    known = [value for value in values if value is not None]
+    if not known or len(known) < len(values):
+        return None, None, None
+    summary = summarize(known)
+    return summary.mean, summary.iqm, interval_text(summary.values, summary.low, summary.high)
+
+
+def interval_text(values: Sequence[float], low: float | None, high: float | None) -> str:
+    """The 95% interval as text, or the values of all seeds if there is none."""
+    if low is None or high is None:
+        return "seeds: " + ", ".join(f"{value:.4g}" for value in values)
+    return f"{low:.4g} to {high:.4g}"
+
+
+def _text(cell: Cell) -> str:
+    if cell is None:
+        return "–"
+    if isinstance(cell, float):
+        return f"{cell:,.0f}" if abs(cell) >= 10_000 else f"{cell:.4g}"
+    return str(cell).replace("|", "\\|")
 
 
 def final_table(name: str, results: Sequence[RunResult], *, stored: float | None = None) -> Table:
@@ -67,25 +117,46 @@ def adaptation_table(name: str, results: Sequence[RunResult]) -> Table | None:
     return Table(name, ("protocol", "method", "seed", "fold", "episode", "return"), rows) if rows else None
 
 
-def verdict_table(name: str, verdicts: Sequence[Verdict]) -> Table:
-    """Claims with the mean difference, its interval or the runs' differences, p values, and the verdict."""
+def claims_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Table:
+    """All verdicts: mean difference, its interval or the runs' differences, p value, and what they cover."""
     rows: list[tuple[Cell, ...]] = []
-    for found in verdicts:
+    for experiment, found in ((experiment, found) for experiment, all_ in judged.items() for found in all_):
         interval = interval_text(found.differences, found.low, found.high) if found.pairs else None
-        what = (found.claim, found.environment, found.comparison, found.protocol)
-        unequal = "; ".join(found.unequal) or None
+        what = (experiment, found.claim, found.environment, found.comparison, found.protocol)
         test = "registered" if found.is_registered else "exploratory"
+        unequal = "; ".join(found.unequal) or None
         rows.append((*what, found.mean, interval, found.adjusted, test, found.verdict, unequal, found.covers))
-    columns = ("claim", "environment", "compared", "protocol", "mean difference", "95% interval")
+    columns = (
+        "experiment",
+        "claim",
+        "environment",
+        "compared",
+        "protocol",
+        "mean difference",
+        "95% interval",
+    )
     more = ("p", "test", "verdict", "unequal settings", "interval covers")
     return Table(name, (*columns, *more), tuple(rows))
 
 
-def claims_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Table:
-    """The verdicts on several experiments in one table."""
-    tables = {experiment: verdict_table(name, verdicts) for experiment, verdicts in judged.items()}
-    rows = tuple((experiment, *row) for experiment, table in tables.items() for row in table.rows)
-    return Table(name, ("experiment", *next(iter(tables.values())).columns), rows)
+def registered_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Table:
+    """The verdict on every registered claim, with its effect size and interval."""
+    rows: list[tuple[Cell, ...]] = [
+        (
+            found.verdict,
+            found.claim,
+            found.environment,
+            found.effect,
+            found.mean,
+            interval_text(found.differences, found.low, found.high) if found.pairs else None,
+            len(found.pairs),
+        )
+        for verdicts in judged.values()
+        for found in verdicts
+        if found.is_registered
+    ]
+    columns = ("verdict", "claim", "environment", "effect size", "mean difference", "95% interval", "pairs")
+    return Table(name, columns, tuple(rows))
 
 
 def published_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:

@@ -19,8 +19,7 @@ from tcmrl_algo.experiment.results import (
     write_table,
 )
 from tcmrl_algo.experiment.tunings import TrialRow, read_tuning, trial_rows
-from tcmrl_algo.reporting.measuring import Measured
-from tcmrl_algo.reporting.returns import DatasetReturns
+from tcmrl_algo.report.sources import DatasetReturns, Source
 from tcmrl_algo.training.config import stage_plan
 from tcmrl_data import CheckpointError, Worth
 from tcmrl_data.foundation.canonical import digest
@@ -167,14 +166,14 @@ class WorthRow:
     dynamics_last: float | None
 
 
-def add_rows(file: Path, measured: Iterable[Measured]) -> list[RunRow]:
+def add_rows(file: Path, sources: Iterable[Source]) -> list[RunRow]:
     """Puts the runs of results folders into a table, and their learning curves into `curves.csv` beside it.
 
     A row takes the place of an earlier one of the same experiment, data, method, seed, fold and protocol.
 
     Args:
         file: the table; it is made if there is none.
-        measured: of results folders, whose names the experiments have in the table.
+        sources: of results folders, whose names the experiments have in the table.
 
     Returns:
         The rows of these runs.
@@ -184,8 +183,7 @@ def add_rows(file: Path, measured: Iterable[Measured]) -> list[RunRow]:
     """
     rows: list[RunRow] = []
     curves: list[CurveRow] = []
-    for found in measured:
-        source = found.source
+    for source in sources:
         folder = (source.runs[0].folder or Path()).parents[1]
         if not (folder / "experiment.json").is_file():
             raise CheckpointError(

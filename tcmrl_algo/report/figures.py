@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tcmrl_algo.experiment.aggregate import mean_interval, summarize
-from tcmrl_algo.experiment.results import RunResult, by_method
-from tcmrl_algo.reporting.contexts import FloatArray, IntArray, TransitionWeights
+from tcmrl_algo.experiment.results import RunResult
+from tcmrl_algo.report.contexts import FloatArray, IntArray, TransitionWeights
+from tcmrl_algo.report.statistics import by_method, mean_interval, summarize
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

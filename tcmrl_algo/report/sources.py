@@ -1,20 +1,116 @@
-"""Inputs of a report: results folders of experiments, and single runs."""
+"""Inputs of a report: results folders and single runs, and what checkpoints and datasets tell of them."""
 
 import itertools
 import re
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.adaptation.evaluate import evaluate_run
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
-from tcmrl_algo.experiment.results import AGAIN, RunResult, error_file, read_results, result_file
+from tcmrl_algo.experiment.results import (
+    AGAIN,
+    RunResult,
+    error_file,
+    read_results,
+    result_file,
+    rounded,
+)
 from tcmrl_algo.experiment.spec import Experiment, experiment_of, folder_name, read_experiment, run_id
-from tcmrl_algo.reporting.returns import DatasetReturns
+from tcmrl_algo.report.contexts import FloatArray, IntArray, Trained, TransitionWeights
 from tcmrl_algo.training.checkpoint import Run, open_run, tensors_digest
-from tcmrl_data import CheckpointError, canonical_json, open_dataset
+from tcmrl_data import CheckpointError, Dataset, TcmrlError, canonical_json, list_returns, open_dataset
 from tcmrl_data.foundation.records import read_record
+
+
+class SnapshotReturns(BaseModel):
+    """Mean returns of the stored episodes of one snapshot, over tasks.
+
+    Attributes:
+        step: of the snapshot; None for all snapshots together.
+        train, test: mean over training and over test tasks; None where there is no such snapshot.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    step: int | None
+    train: float | None
+    test: float | None
+
+
+class DatasetReturns(BaseModel):
+    """`datasets/ENVIRONMENT.json` of a report: what was stored in the dataset of an environment.
+
+    Attributes:
+        environment, root, profile: which dataset.
+        train_tasks, test_tasks: number of tasks.
+        snapshots: by ascending step, and last all together.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    environment: str
+    root: str
+    profile: str
+    train_tasks: int
+    test_tasks: int
+    snapshots: tuple[SnapshotReturns, ...]
+
+    @property
+    def test_return(self) -> float | None:
+        """Mean return of all stored episodes of the test tasks."""
+        return self.snapshots[-1].test if self.snapshots else None
+
+
+def dataset_returns(dataset: Dataset) -> DatasetReturns:
+    """Mean returns of the stored episodes of a dataset, over tasks, by snapshot."""
+    tasks = list_returns(dataset)["tasks"]
+    steps: list[int | None] = sorted({found["step"] for task in tasks for found in task["snapshots"]})
+    return DatasetReturns(
+        environment=dataset.name,
+        root=dataset.manifest.root,
+        profile=dataset.manifest.profile,
+        train_tasks=len(dataset.train_tasks),
+        test_tasks=len(dataset.test_tasks),
+        snapshots=tuple(
+            SnapshotReturns(step=step, train=_mean(tasks, "train", step), test=_mean(tasks, "test", step))
+            for step in (*steps, None)
+        ),
+    )
+
+
+def _mean(tasks: Sequence[dict[str, Any]], split: str, step: int | None) -> float | None:
+    means = [
+        found["mean"]
+        for task in tasks
+        if task["split"] == split
+        for found in task["snapshots"]
+        if step in (None, found["step"])
+    ]
+    mean: float | None = rounded(float(np.mean(means))) if means else None
+    return mean
+
+
+@dataclass(frozen=True)
+class Contexts:
+    """Contexts and attention of the first run of every method in one environment, for figures.
+
+    Attributes:
+        points: contexts by method, (trajectories, latent); methods without contexts are left out.
+        labels: task of every context, by method.
+        is_test: whether a task is a test task.
+        weights: attention, by method; methods without attention are left out.
+    """
+
+    points: Mapping[str, FloatArray]
+    labels: Mapping[str, IntArray]
+    is_test: Sequence[bool]
+    weights: Mapping[str, TransitionWeights]
 
 
 @dataclass(frozen=True)
@@ -25,13 +121,17 @@ class Source:
         experiment: the experiment.
         runs: its finished runs.
         unfinished: ids of its other runs, with the error of those that failed.
-        datasets: returns of the datasets, by environment, as far as an earlier report measured them.
+        datasets: returns of the datasets, by environment, as far as they are known.
+        contexts: for figures, by environment, as far as checkpoints and datasets are there.
+        unmeasured: why an environment has no measured contexts, by environment.
     """
 
     experiment: Experiment
     runs: tuple[RunResult, ...]
     unfinished: Mapping[str, str | None] = field(default_factory=dict)
     datasets: Mapping[str, DatasetReturns] = field(default_factory=dict)
+    contexts: Mapping[str, Contexts] = field(default_factory=dict)
+    unmeasured: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def failed(self) -> dict[str, str]:
@@ -65,7 +165,10 @@ class Source:
 
 
 def read_sources(
-    paths: Sequence[Path], report: Callable[[str, int, int], None], *, datasets: Sequence[Path] = ()
+    paths: Sequence[Path],
+    report: Callable[[str, int, int], None] | None = None,
+    *,
+    datasets: Sequence[Path] = (),
 ) -> list[Source]:
     """Reads results folders in the given order; then all run folders as one source, evaluating the runs.
 
@@ -129,9 +232,11 @@ def _results_folder(path: Path, places: Mapping[str, str]) -> Source:
 
 def _unfinished(path: Path, experiment: Experiment) -> dict[str, str | None]:
     found: dict[str, str | None] = {}
-    for environment, method, seed, fold in itertools.product(
-        experiment.environments, experiment.methods, experiment.seeds, experiment.fold_numbers
+    for environment, (method, choice), seed, fold in itertools.product(
+        experiment.environments, experiment.methods.items(), experiment.seeds, experiment.fold_numbers
     ):
+        if not choice.runs_in(environment):
+            continue
         name = run_id(environment, method, seed, fold)
         if not result_file(path / "runs" / name).is_file():
             error = error_file(path / "runs" / name)
@@ -140,7 +245,7 @@ def _unfinished(path: Path, experiment: Experiment) -> dict[str, str | None]:
 
 
 def _single_runs(
-    runs: Sequence[Run], report: Callable[[str, int, int], None], places: Mapping[str, str]
+    runs: Sequence[Run], report: Callable[[str, int, int], None] | None, places: Mapping[str, str]
 ) -> Source:
     """Single runs as an experiment; runs of one algorithm are the seeds of one method."""
     labels = labels_of(runs)
@@ -160,10 +265,10 @@ def _single_runs(
         place="the run folders",
     )
     found = []
-    for done, (label, run) in enumerate(zip(labels, runs, strict=True)):
-        report("evaluating", done, len(runs))
+    for done, (label, run) in enumerate(zip(labels, runs, strict=True), start=1):
         found.append(_evaluated(label, run, places.get(run.record.root)))
-    report("evaluating", len(runs), len(runs))
+        if report is not None:
+            report("evaluating", done, len(runs))
     order = list(experiment.methods)
 
     def place_of(run: RunResult) -> tuple[str, int, int]:
@@ -222,4 +327,48 @@ def _evaluated(label: str, run: Run, place: str | None) -> RunResult:
         training_seconds=None,
         evaluation_seconds=None,
         peak_memory=None,
+    )
+
+
+def measured(source: Source) -> Source:
+    """The source with compact results that hold what checkpoints and datasets tell, or an earlier report."""
+    trained = Trained()
+    results: dict[str, list[RunResult]] = {}
+    datasets, contexts, unmeasured = dict(source.datasets), {}, {}
+    for environment in source.environments():
+        runs = source.results(environment)
+        try:
+            results[environment] = [_measured(run, trained) for run in runs]
+            contexts[environment] = _contexts(runs, trained)
+            datasets[environment] = dataset_returns(trained.stored(runs[0]).dataset)
+        except TcmrlError as error:
+            results[environment] = runs
+            if not _has_measures(environment, runs, datasets):
+                unmeasured[environment] = str(error)
+    kept = tuple(result.compact() for found in results.values() for result in found)
+    return replace(source, runs=kept, datasets=datasets, contexts=contexts, unmeasured=unmeasured)
+
+
+def _measured(run: RunResult, trained: Trained) -> RunResult:
+    return run.model_copy(update={"contexts": trained.contexts(run).measures()})
+
+
+def _has_measures(
+    environment: str, runs: Sequence[RunResult], datasets: Mapping[str, DatasetReturns]
+) -> bool:
+    return environment in datasets and all(run.contexts is not None for run in runs)
+
+
+def _contexts(runs: Sequence[RunResult], trained: Trained) -> Contexts:
+    first: dict[str, RunResult] = {}
+    for run in runs:
+        if run.fold == runs[0].fold:
+            first.setdefault(run.label, run)
+    found = {method: trained.contexts(run) for method, run in first.items()}
+    points = {method: run.contexts for method, run in found.items() if run.contexts is not None}
+    return Contexts(
+        points=points,
+        labels={method: found[method].labels for method in points},
+        is_test=[task.split == "test" for task in trained.stored(runs[0]).tasks],
+        weights={method: run.weights for method, run in found.items() if run.weights is not None},
     )
