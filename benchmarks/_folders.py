@@ -5,7 +5,6 @@ and validated every `part.json`, looked at every file and checked every `zarr.js
 file by file.
 """
 
-import functools
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -23,7 +22,7 @@ from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem, read_plain_file
 from tcmrl_data.foundation.records import Record, _with_tuples
 from tcmrl_data.sampling.rows import READERS, ROW_ARRAYS, Table, fill_rows
-from tcmrl_data.store.arrays import ARRAYS, _ArrayMetadata, _decode_chunk, chunk_problem
+from tcmrl_data.store.arrays import ARRAYS, _decode_chunk, _parse_layout, chunk_problem
 from tcmrl_data.store.arrays import ArrayLayout as Layout
 from tcmrl_data.store.part import RECORD, PartRecord
 from tcmrl_data.store.tables import SHA256
@@ -125,13 +124,7 @@ def _open_folder(folder: Path, place: str) -> FolderRecord:
 
 def _layout(path: Path, name: str) -> Layout:
     assert folder_problem(path, name) is None
-    metadata = _parse_metadata(read_plain_file(path / name / "zarr.json", limit=2**16))
-    return Layout(name, metadata.data_type, metadata.shape, metadata.chunks)
-
-
-@functools.lru_cache(maxsize=512)
-def _parse_metadata(data: bytes) -> _ArrayMetadata:
-    return _ArrayMetadata.model_validate_json(canonical_json(parse_json(data)))
+    return _parse_layout(name, read_plain_file(path / name / "zarr.json", limit=2**16))
 
 
 def _read_arrays(path: Path, names: Sequence[str]) -> dict[str, npt.NDArray[Any]]:

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.foundation.canonical import differences, leaves
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.store.part import STANDARD_ARRAYS, Identity
 from tcmrl_data.store.tables import PartKey
@@ -79,14 +80,10 @@ def _fields(first: Identity, second: Identity) -> Iterator[tuple[Stage, str]]:
             yield stage, _value_difference(left, right)
 
 
-def _value_difference(left: Any, right: Any, place: str = "") -> str:
-    if isinstance(left, Mapping) and isinstance(right, Mapping):
-        for name in sorted({*left, *right}):
-            if left.get(name) != right.get(name):
-                return _value_difference(
-                    left.get(name), right.get(name), f"{place}.{name}" if place else name
-                )
-    return f"{place} {_short(left)} → {_short(right)}".strip()
+def _value_difference(left: Any, right: Any) -> str:
+    """The first value that differs, by its place."""
+    place, one, other = next(differences(left, right))
+    return f"{place} {_short(one)} → {_short(other)}".strip()
 
 
 def _short(value: Any) -> str:
@@ -297,16 +294,12 @@ def diff_datasets(
 
 def _recipe(dataset: Dataset) -> dict[str, Any]:
     recipe = dataset.manifest.recipe.unit_settings()
-    return dict(flat({**recipe, "profile": dataset.manifest.profile}))
+    return _flat({**recipe, "profile": dataset.manifest.profile})
 
 
-def flat(values: Any, place: str = "") -> Iterator[tuple[str, Any]]:
+def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
     """The values of nested tables by their dotted names."""
-    if isinstance(values, Mapping) and values:
-        for key, value in values.items():
-            yield from flat(value, f"{place}.{key}" if place else str(key))
-    else:
-        yield place, values
+    return {".".join(map(str, path)): value for path, value in leaves(values)}
 
 
 def _runs(dataset: Dataset) -> dict[str, Any]:
@@ -324,7 +317,7 @@ def _platforms(dataset: Dataset) -> dict[str, Any]:
     found: dict[str, set[str]] = {}
     for platform in dataset.manifest.platforms:
         values = platform.model_dump(mode="json", exclude={"packages"}) | platform.packages
-        for name, value in flat(values):
+        for name, value in _flat(values).items():
             found.setdefault(name, set()).add(str(value))
     return {name: sorted(values) for name, values in found.items()}
 

@@ -22,11 +22,9 @@ from pydantic import Field, model_validator
 
 from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
-from tcmrl_data.foundation.errors import ManifestError, SelectionError
-from tcmrl_data.foundation.plain_files import one_line, read_plain_file
-from tcmrl_data.foundation.records import Record, count_ranges, parse_record, read_ranges
-from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, Totals
+from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.foundation.records import Record, count_ranges, read_ranges
+from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, Totals, read_document
 from tcmrl_data.store.part_table import PartEntry
 from tcmrl_data.store.tables import MAX_STEPS, MAX_TASKS, RUN_NAME, SHA256, PartKey
 
@@ -288,13 +286,5 @@ def read_view(file: Path) -> ViewFile:
     Raises:
         ManifestError: it is missing, truncated, edited, or of another schema version.
     """
-    try:
-        data = read_plain_file(file, limit=MAX_JSON_BYTES)
-        values = parse_json(data)
-    except (FileNotFoundError, NotADirectoryError):
-        raise ManifestError(
-            f"{file} does not exist; make a view with `tcmrl-data derive --view {file}`"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise ManifestError(f"{file}: not a view ({one_line(error)}); derive it again") from None
-    return parse_record(ViewFile, values, file, version=VIEW_SCHEMA, data=data)
+    missing, damaged = f"make a view with `tcmrl-data derive --view {file}`", "not a view, derive it again"
+    return read_document(ViewFile, file, version=VIEW_SCHEMA, missing=missing, damaged=damaged)[1]

@@ -18,7 +18,6 @@ from tcmrl_data.envs.base import Reward
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.machine import available_memory, size
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_sequence
-from tcmrl_data.sampling.cache import cached_rows
 from tcmrl_data.sampling.draws import BatchRequest, Draws, Trajectories
 from tcmrl_data.sampling.gather import Batch, Endings, Gatherer, place_table
 from tcmrl_data.sampling.rows import (
@@ -110,6 +109,8 @@ def load_rows(
     limit = available_memory() // 2 if memory_limit is None else memory_limit
     if needed <= limit:
         return read_rows(selection, dense=dense)
+    from tcmrl_data.sampling.cache import cached_rows
+
     if say:
         why = "half of the available memory" if memory_limit is None else "the memory limit"
         say(f"{size(needed)} of steps exceed {why}, {size(limit)}: using the cache")

@@ -3,24 +3,24 @@
 Steps of all episodes lie flat behind one another with `episode_offsets`; observations hold one row more per
 episode, so that row `offset[e] + e + t` is o_t of episode e and next observations are never stored twice.
 
-What the Zarr files may look like is an allow-list, checked before a byte is decoded, and nothing is decoded
-that the size on disk does not justify: arrays may decode to 64 MiB, or to 256 times their files where that
-is more (real parts: at most about 12 times, since sampled actions do not compress).
+A `zarr.json` is compared with what is written here before a byte is decoded, and nothing is decoded that the
+size on disk does not justify: arrays may decode to 64 MiB, or to 256 times their files where that is more
+(real parts: at most about 12 times, since sampled actions do not compress).
 """
 
+import contextlib
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, product
 from math import prod
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import canonical_json, parse_json, sha256
+from tcmrl_data.foundation.canonical import differences, parse_json, sha256
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line
 from tcmrl_data.store.archive import Archive
@@ -44,12 +44,10 @@ DIMENSIONS = {
 }
 """Axes of the arrays that are not one value per step; an episode has one observation row more than steps."""
 
-_CODECS = (
-    {"name": "bytes", "configuration": {"endian": "little"}},
-    {"name": "zstd", "configuration": {"level": 3, "checksum": False}},
-    {"name": "crc32c"},
-)
-_ONE_BYTE_CODECS = ({"name": "bytes"}, *_CODECS[1:])
+_ENDIAN = {"configuration": {"endian": "little"}}
+_COMPRESSORS = ({"name": "zstd", "configuration": {"level": 3, "checksum": False}}, {"name": "crc32c"})
+_GROUP = {"zarr_format": 3, "node_type": "group", "attributes": {}}
+_OPTIONAL: dict[str, Any] = {"attributes": {}, "storage_transformers": []}
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
@@ -86,6 +84,22 @@ class ArrayLayout:
         """Bytes of all chunks once decoded."""
         return self.chunk_bytes * prod(self.grid)
 
+    @property
+    def document(self) -> dict[str, Any]:
+        """The fields of its `zarr.json` that must be there."""
+        endian = _ENDIAN if ITEM_BYTES[self.dtype] > 1 else {}
+        return {
+            "zarr_format": 3,
+            "node_type": "array",
+            "data_type": self.dtype,
+            "shape": list(self.shape),
+            "chunk_grid": {"name": "regular", "configuration": {"chunk_shape": list(self.chunks)}},
+            "chunk_key_encoding": {"name": "default", "configuration": {"separator": "/"}},
+            "codecs": [{"name": "bytes", **endian}, *_COMPRESSORS],
+            "fill_value": FILL_VALUES[self.dtype],
+            "dimension_names": list(dimension_names(self.name)),
+        }
+
     def files(self) -> list[str]:
         """Names in the archive of `zarr.json` and of every chunk that the shape calls for."""
         chunk_files = ("/".join(map(str, ("c", *index))) for index in product(*map(range, self.grid)))
@@ -93,7 +107,7 @@ class ArrayLayout:
 
 
 def check_layout(archive: Archive, arrays: Mapping[str, Mapping[str, Any]]) -> list[ArrayLayout]:
-    """Checks a part's `zarr.json` files against the allow-list and the part's own record.
+    """Checks a part's `zarr.json` files against what is written here and the part's own record.
 
     Args:
         archive: the part.
@@ -102,7 +116,8 @@ def check_layout(archive: Archive, arrays: Mapping[str, Mapping[str, Any]]) -> l
     Raises:
         StoreError: names the file and the field.
     """
-    _read_metadata(_GroupMetadata, archive, f"{ARRAYS}/zarr.json")
+    with _named_metadata(archive, f"{ARRAYS}/zarr.json") as data:
+        _check_equal({"attributes": {}} | _parse_table(data), _GROUP)
     layouts = []
     for name, record in arrays.items():
         layout = read_layout(archive, name)
@@ -119,21 +134,21 @@ def read_layout(archive: Archive, name: str) -> ArrayLayout:
     """The layout of an array.
 
     Raises:
-        StoreError: its `zarr.json` is missing or outside the allow-list.
+        StoreError: its `zarr.json` is missing, or not as it is written here.
     """
     file = f"{ARRAYS}/{name}/zarr.json"
-    metadata = _read_metadata(_ArrayMetadata, archive, file)
-    if metadata.dimension_names != dimension_names(name):
-        raise StoreError(
-            f"{archive.place(file)}: dimension_names {str(metadata.dimension_names)[:200]} are not "
-            f"{dimension_names(name)}, those of {name}"
-        )
-    layout = ArrayLayout(name, metadata.data_type, metadata.shape, metadata.chunks)
-    if prod(layout.grid) > MAX_CHUNKS:
-        raise StoreError(
-            f"{archive.place(file)}: shape {list(layout.shape)} calls for over {MAX_CHUNKS} chunks"
-        )
-    return layout
+    with _named_metadata(archive, file) as data:
+        return _parse_layout(name, data)
+
+
+@contextlib.contextmanager
+def _named_metadata(archive: Archive, file: str) -> Iterator[bytes]:
+    """The content of a `zarr.json`; names the file in errors of the block."""
+    data = archive.read(file, limit=METADATA_BYTES)
+    try:
+        yield data
+    except ValueError as error:
+        raise StoreError(f"{archive.place(file)}: not readable as zarr.json ({one_line(error)})") from None
 
 
 def check_expansion(layouts: Iterable[ArrayLayout], stored_bytes: int, place: object) -> None:
@@ -176,83 +191,51 @@ def _frame_content_bytes(data: bytes) -> int | None:
     return int.from_bytes(data[start : start + width], "little") + (256 if width == 2 else 0)
 
 
-class _Metadata(BaseModel):
-    """What every `zarr.json` of a part may say."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
-
-    zarr_format: Literal[3]
-    attributes: dict[str, Any] = Field(default={}, max_length=0)
-
-
-class _GroupMetadata(_Metadata):
-    node_type: Literal["group"]
-
-
-class _ChunkShape(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    chunk_shape: tuple[Annotated[int, Field(ge=1, lt=2**40)], ...]
-
-
-class _ChunkGrid(BaseModel):
-    model_config = ConfigDict(extra="forbid", strict=True)
-
-    name: Literal["regular"]
-    configuration: _ChunkShape
-
-
-class _ArrayMetadata(_Metadata):
-    node_type: Literal["array"]
-    data_type: Literal["float32", "int64", "bool"]
-    shape: tuple[Annotated[int, Field(ge=0, lt=2**40)], ...] = Field(min_length=1, max_length=2)
-    chunk_grid: _ChunkGrid
-    chunk_key_encoding: dict[str, Any]
-    codecs: tuple[dict[str, Any], ...]
-    fill_value: str | float | bool
-    dimension_names: tuple[str, ...]
-    storage_transformers: tuple[Any, ...] = Field(default=(), max_length=0)
-
-    @property
-    def chunks(self) -> tuple[int, ...]:
-        return self.chunk_grid.configuration.chunk_shape
-
-    @model_validator(mode="after")
-    def _as_written_here(self) -> "_ArrayMetadata":
-        if len(self.dimension_names) != len(self.shape):
-            raise ValueError(f"shape {self.shape} has not one axis per name in dimension_names")
-        if len(self.chunks) != len(self.shape) or any(
-            chunk > max(1, size) for chunk, size in zip(self.chunks, self.shape, strict=True)
-        ):
-            raise ValueError(f"chunk_grid {self.chunks} does not fit shape {self.shape}")
-        if self.chunk_key_encoding != {"name": "default", "configuration": {"separator": "/"}}:
-            raise ValueError(f"chunk_key_encoding {str(self.chunk_key_encoding)[:200]} is not allowed")
-        if self.codecs not in (_CODECS, _ONE_BYTE_CODECS):
-            raise ValueError(f"codecs {str(self.codecs)[:200]} are not allowed")
-        if self.fill_value != FILL_VALUES[self.data_type]:
-            raise ValueError(f"fill_value {str(self.fill_value)[:40]!r} is not allowed for {self.data_type}")
-        return self
-
-
-Metadata = TypeVar("Metadata", bound=_Metadata)
-
-
-def _read_metadata(kind: type[Metadata], archive: Archive, name: str) -> Metadata:
-    data = archive.read(name, limit=METADATA_BYTES)
-    try:
-        metadata: Metadata = _parse_metadata(kind, data)
-        return metadata
-    except ValidationError as error:
-        detail = error.errors()[0]
-        field = ".".join(map(str, detail["loc"])) or "values"
-        raise StoreError(f"{archive.place(name)}: {field}: {detail['msg']}") from None
-    except ValueError as error:
-        raise StoreError(f"{archive.place(name)}: not readable as zarr.json ({one_line(error)})") from None
-
-
 @functools.lru_cache(maxsize=512)  # parts of equally long episodes have the same files, byte for byte
-def _parse_metadata(kind: type[Metadata], data: bytes) -> Metadata:
-    return kind.model_validate_json(canonical_json(parse_json(data)))
+def _parse_layout(name: str, data: bytes) -> ArrayLayout:
+    """The layout in an array's `zarr.json`; raises `ValueError` for anything but what is written here."""
+    found = _OPTIONAL | _parse_table(data)
+    dtype = found.get("data_type")
+    if not isinstance(dtype, str) or dtype not in ITEM_BYTES:
+        raise ValueError(f"data_type {str(dtype)[:80]} is not allowed")
+    try:
+        chunks = found["chunk_grid"]["configuration"]["chunk_shape"]
+    except (LookupError, TypeError):
+        raise ValueError("chunk_grid has no chunk_shape") from None
+    layout = ArrayLayout(
+        name,
+        dtype,
+        _sizes(found.get("shape"), "shape", least=0),
+        _sizes(chunks, "chunk_grid.configuration.chunk_shape", least=1),
+    )
+    if len(layout.shape) != len(dimension_names(name)):
+        raise ValueError(f"shape {list(layout.shape)} has not the axes of {name}")
+    if len(chunks) != len(layout.shape) or any(
+        chunk > max(1, size) for chunk, size in zip(chunks, layout.shape, strict=True)
+    ):
+        raise ValueError(f"chunk_grid {chunks} does not fit shape {list(layout.shape)}")
+    if prod(layout.grid) > MAX_CHUNKS:
+        raise ValueError(f"shape {list(layout.shape)} calls for over {MAX_CHUNKS} chunks")
+    _check_equal(found, _OPTIONAL | layout.document)
+    return layout
+
+
+def _parse_table(data: bytes) -> dict[str, Any]:
+    values = parse_json(data)
+    if not isinstance(values, dict):
+        raise ValueError("it is no table")
+    return values
+
+
+def _sizes(value: Any, what: str, *, least: int) -> tuple[int, ...]:
+    if not isinstance(value, list) or not all(type(size) is int and least <= size < 2**40 for size in value):
+        raise ValueError(f"{what} {str(value)[:80]} is not allowed")
+    return tuple(value)
+
+
+def _check_equal(found: Mapping[str, Any], written: Mapping[str, Any]) -> None:
+    for place, value, _ in differences(found, written):
+        raise ValueError(f"{place[:80]} {str(value)[:80]} is not allowed")
 
 
 Arrays = Mapping[str, npt.NDArray[Any]]

@@ -15,8 +15,8 @@ from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file, words_after
-from tcmrl_data.foundation.records import Record, parse_record, read_ranges, sealed
+from tcmrl_data.foundation.plain_files import one_line, read_plain_file, words_after
+from tcmrl_data.foundation.records import Kind, Record, parse_record, read_ranges, sealed
 from tcmrl_data.recipe import Profile
 from tcmrl_data.recipe.document import AND, joined_licences
 from tcmrl_data.recipe.recipe import Recipe
@@ -305,41 +305,26 @@ def copy_problem(folder: Path) -> str | None:
 
 
 def _parse_manifest(file: Path) -> tuple[bytes, Manifest]:
-    """The content of a manifest's file, and what it says; errors as of `read_manifest`."""
+    missing = f"build a dataset with `tcmrl-data build ENV --out {file.parent}`"
+    return read_document(Manifest, file, version=MANIFEST_SCHEMA, missing=missing, damaged="not a manifest")
+
+
+def read_document(
+    kind: type[Kind], file: Path, *, version: int, missing: str, damaged: str
+) -> tuple[bytes, Kind]:
+    """The content of a JSON file that holds its own digest, and what it says.
+
+    Raises:
+        ManifestError: the file is `missing` or `damaged`, in these words, or its digest or a field is wrong.
+    """
     try:
         data = read_plain_file(file, limit=MAX_JSON_BYTES)
         values = parse_json(data)
     except (FileNotFoundError, NotADirectoryError):
-        raise ManifestError(
-            f"{file} does not exist; build a dataset with `tcmrl-data build ENV --out {file.parent}`"
-        ) from None
+        raise ManifestError(f"{file} does not exist; {missing}") from None
     except (OSError, ValueError) as error:
-        raise ManifestError(f"{file}: not a manifest ({one_line(error)})") from None
-    _refuse_older(values, file)
-    return data, parse_record(Manifest, values, file, version=MANIFEST_SCHEMA, data=data)
-
-
-def _refuse_older(values: Any, file: Path) -> None:
-    """Refuses a manifest of schema 1 with the command that builds the dataset again.
-
-    Raises:
-        ManifestError: the manifest has schema version 1.
-    """
-    version = values.get("schema_version") if isinstance(values, dict) else None
-    if version != 1 or isinstance(version, bool):
-        return
-    recipe = values.get("recipe")
-    profile = recipe.get("profile") if isinstance(recipe, dict) else None
-    words = [
-        str(values.get("name"))[:64],
-        f"--profile {str(profile)[:20]}",
-        f"--seed {str(values.get('seed'))[:20]}",
-    ]
-    command = printable(" ".join(["tcmrl-data build", *words, "--out FOLDER"]))
-    raise ManifestError(
-        f"{file}: schema_version 1 is of an earlier tcmrl, which this one does not read; build the dataset "
-        f"again in a new folder: `{command}`"
-    )
+        raise ManifestError(f"{file}: {damaged} ({one_line(error)})") from None
+    return data, parse_record(kind, values, file, version=version, data=data)
 
 
 def totals_of(table: PartTable) -> Totals:
@@ -367,17 +352,7 @@ def write_dataset(
 ) -> Manifest:
     """Writes the tables and then the manifest that seals them; the dataset exists from then on.
 
-    Args:
-        folder: the dataset, where the parts of the table are.
-        name: the environment's name.
-        label: the dataset's own name.
-        data_version: of the parts.
-        runs: how the parts were made; the first has a recipe.
-        derivation: how the dataset was derived from others.
-        platforms: of the parts; the table refers to them by position.
-        tasks: all tasks, dropped ones too.
-        dropped: indices of tasks that do not belong to the dataset.
-        table: all parts.
+    The fields are those of `Manifest`; `tasks` and `table` hold those of dropped tasks too.
 
     Raises:
         StorageError: the operating system refuses an operation.
@@ -417,20 +392,7 @@ def manifest_bytes(
     dropped: Collection[int],
     kept: PartTable,
 ) -> bytes:
-    """The file of a manifest.
-
-    Args:
-        name: the environment's name.
-        label: the dataset's own name.
-        data_version: of the parts.
-        runs: how the parts were made.
-        derivation: how the dataset was derived from others.
-        platforms: of the parts.
-        tasks: seal of the table of all tasks, dropped ones too.
-        parts: seal of the table of all parts.
-        dropped: indices of tasks that do not belong to the dataset.
-        kept: the parts of the other tasks.
-    """
+    """The file of a manifest of the given fields; `kept` are the parts of the tasks that are not dropped."""
     fields = {
         "schema_version": MANIFEST_SCHEMA,
         "name": name,
@@ -450,13 +412,7 @@ def manifest_bytes(
 
 
 def is_complete(table: PartTable, runs: Sequence[Run], *, num_tasks: int) -> bool:
-    """Whether every task has the snapshots that the runs plan.
-
-    Args:
-        table: parts of the tasks that belong to the dataset.
-        runs: of the dataset.
-        num_tasks: number of those tasks.
-    """
+    """Whether `num_tasks` tasks, whose parts the table holds, all have the snapshots that the runs plan."""
     return all(
         table.num_parts(run.name) == len(run.steps) * num_tasks for run in runs if run.steps is not None
     )
