@@ -22,7 +22,7 @@ from tcmrl_data.describe.measures import ACTION_BINS, SATURATED, Content, choose
 from tcmrl_data.describe.render import Strips, film_strips
 from tcmrl_data.describe.report import report_html
 from tcmrl_data.foundation.errors import RenderingError
-from tcmrl_data.page.page import cell_text
+from tcmrl_data.foundation.page import cell_text
 from tcmrl_data.quality.worth import context_worth
 from tcmrl_data.store.tables import PartKey
 from tests.commands import assert_refused, in_process

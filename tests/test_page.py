@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from tcmrl_data.page.page import cell_text, render_page
+from tcmrl_data.foundation.page import cell_text, render_page
 
 HOSTILE = "_</script> $\\frac{$ <img src=x onerror=alert(1)> & \"quoted\" 'single' %{x} {{ title }}"
 TEMPLATE = """{% extends "page.html.jinja" %}

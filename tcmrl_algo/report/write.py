@@ -25,8 +25,8 @@ from tcmrl_algo.report.sources import Contexts, Source, measured, natural_order,
 from tcmrl_algo.report.statistics import SCORES, Verdict, judge, known_scores
 from tcmrl_algo.report.tables import Table
 from tcmrl_data.foundation.disk import make_folders, replace_file
+from tcmrl_data.foundation.page import allowed_text, render_page
 from tcmrl_data.foundation.records import write_record
-from tcmrl_data.page.page import allowed_text, render_page
 
 ReportProgress = Callable[[str, int, int], None]
 """Receives the name of a stage, the amount done and the total amount."""

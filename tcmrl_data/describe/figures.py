@@ -13,8 +13,8 @@ from plotly.graph_objects import Bar, Figure, Heatmap, Scatter
 
 from tcmrl_data.dataset.listing import SPLITS, summarize_returns
 from tcmrl_data.describe.measures import ACTION_BINS, BROWSED_COLUMNS, Browsed, Content
+from tcmrl_data.foundation.page import escaped
 from tcmrl_data.foundation.seeding import evenly_spread
-from tcmrl_data.page.page import escaped
 from tcmrl_data.quality.measured import STEPS_LABEL, TICKS
 from tcmrl_data.quality.transfer import Transfer
 from tcmrl_data.store.tables import MAIN_RUN, PartKey

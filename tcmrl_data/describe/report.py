@@ -13,8 +13,8 @@ from tcmrl_data.describe.verdicts import judge
 from tcmrl_data.foundation.disk import make_folders, replace_file
 from tcmrl_data.foundation.errors import RenderingError
 from tcmrl_data.foundation.machine import size
+from tcmrl_data.foundation.page import render_page
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.page.page import render_page
 
 EPISODES = 20
 """Whole episodes of a report."""

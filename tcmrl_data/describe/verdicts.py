@@ -7,7 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tcmrl_data.describe.measures import Content
-from tcmrl_data.page.page import cell_text
+from tcmrl_data.foundation.page import cell_text
 from tcmrl_data.quality.worth import context_worth
 
 Tone = Literal["good", "note", "plain"]
