@@ -40,7 +40,6 @@ class TrainingState:
     Attributes:
         values: JSON values. `steps` is the number of environment steps done. The optional `failed` maps the
             index (as text) of each task that failed to its first snapshot step that will never exist.
-        arrays: arrays by name.
     """
 
     values: Mapping[str, Any]
@@ -51,8 +50,6 @@ class CheckpointFolder:
     """The latest checkpoint of a unit's training.
 
     Args:
-        dataset: folder of the dataset.
-        unit: name of the unit's subfolder.
         key: digest of everything that the training depends on.
         missing: by index of each incomplete task, its first missing snapshot step. A checkpoint at this step
             or later is ignored, unless the task had failed by then.
@@ -173,7 +170,6 @@ class BehaviorContext:
     """What a source receives to make the policies of a unit, the tasks that are trained together.
 
     Attributes:
-        seed: root seed of the build.
         observation: the view that policies receive.
         reward: the reward that they are trained on.
         report: called with the number of environment steps since the last call.

@@ -35,7 +35,7 @@ class SacSettings(BaseModel):
     Attributes:
         hidden: widths of the actor's and the critics' ReLU layers.
         steps: environment steps of training.
-        warmup: uniform random steps before the first update.
+        warmup: uniform random steps before the first update (published code of CSRO: 2,000).
         snapshots: steps at which the policy is stored: 0, then steps after the warm-up (in which the policy
             does not change), up to `steps`.
         train_frequency: environment steps between updates.
@@ -47,7 +47,7 @@ class SacSettings(BaseModel):
 
     hidden: tuple[int, ...] = Field(default=(256, 256), min_length=1)
     steps: int = Field(ge=1)
-    warmup: int = Field(ge=0)
+    warmup: int = Field(default=2_000, ge=0)
     snapshots: tuple[int, ...] = Field(min_length=2)
     learning_rate: float = Field(default=3e-4, gt=0)
     batch_size: int = Field(default=256, ge=1)

@@ -41,8 +41,6 @@ def import_sac(file: Path, out: Path, *, observation: ObservationView) -> Snapsh
     Runs no code of the file.
 
     Args:
-        file: a file written by `SAC.save`.
-        out: the new folder.
         observation: the view that the policy was trained with.
 
     Raises:

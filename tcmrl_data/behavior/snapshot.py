@@ -77,7 +77,6 @@ class Snapshot:
 
     Attributes:
         step: environment steps of training; for scripted policies the index of the noise level.
-        description: content of `policy.json`.
         tensors: float32 weights by name; empty for scripted policies.
     """
 

@@ -25,14 +25,15 @@ class StackedSettings(SacSettings):
     """The `[behavior.stacked]` table: that of `sac`, and the grouping of tasks.
 
     Attributes:
-        group: task indices per group; part of the data's identity, because it may change rounding.
+        group: task indices per group, by default ours, since larger groups gain little; part of the data's
+            identity, because it may change rounding.
         device: device of networks and replay buffers; devices round differently.
         matmul_precision: torch's precision of float32 matrix products in training. `medium` multiplies in
             bfloat16 on processors that support it: faster, with errors up to about 1e-2 of a product's
             standard deviation, which are measured and recorded with every part.
     """
 
-    group: int = Field(ge=1)
+    group: int = Field(default=10, ge=1)
     device: Literal["cpu", "cuda"] = "cpu"
     matmul_precision: Literal["highest", "medium"] = "highest"
 

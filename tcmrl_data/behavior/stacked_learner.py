@@ -253,7 +253,6 @@ class StackedSac:
         """Initializes one agent's networks like torch's Linear, uniform within +-1 / sqrt(inputs).
 
         Args:
-            agent: the agent's index.
             uniform: draws uniform numbers from [-1, 1) in a given shape.
         """
         for network, stack in ((agent, self.actors), *self._critics_of(agent)):

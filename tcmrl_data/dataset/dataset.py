@@ -304,9 +304,6 @@ class Dataset:
         """Arrays of a part: flat steps, observations with one row more per episode, offsets.
 
         Args:
-            task: index of the task.
-            step: snapshot step.
-            run: name of the run.
             names: of the arrays; all where None.
         """
         with self._checked_part(PartKey(task, step, run)) as (archive, record):
@@ -351,7 +348,6 @@ class Dataset:
         """A view of some tasks and snapshots.
 
         Args:
-            split: only tasks of this split.
             tasks: only these indices; one that is named twice counts once.
             snapshots: `all`, `last`, `steps>=N`, `return>=Q`: of each task, the parts whose mean
                 return reaches the quantile Q in [0, 1] of the task's parts; or `tier:NAME`.

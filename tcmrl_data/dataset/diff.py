@@ -23,7 +23,6 @@ class Cause:
     """The first cause of a difference.
 
     Attributes:
-        key: the part's.
         stage: the first stage of the pipeline that differs; later ones follow from it.
         detail: what differs in it.
         platform: how the left part's platform (here) differs from the right one's (there).
@@ -39,8 +38,6 @@ def first_cause(left: Dataset, right: Dataset, key: PartKey, *, decode: bool) ->
     """Why the parts of a key differ.
 
     Args:
-        left: a dataset.
-        right: another one.
         key: of a part that both have, with different ids.
         decode: also read policies and arrays, to name the first tensor, or the first step.
 
@@ -168,7 +165,6 @@ class ReturnsDiff:
     Attributes:
         left: mean over the tasks of the left dataset.
         right: mean over the tasks of the right one.
-        difference: right minus left.
         low: lower end of Welch's 95% interval of the difference; None with fewer than two tasks in a dataset.
         high: upper end.
     """
@@ -202,17 +198,10 @@ class DatasetDiff:
     """What differs between two datasets.
 
     Attributes:
-        left: where the one lies.
-        right: where the other lies.
-        roots: of both.
         recipe: keys of the recipes that differ; their training defaults do not count.
-        runs: runs that differ.
         platforms: names of packages and of parts of platforms, with all values of each side.
         tasks: tasks that one side lacks, or that have another split or other parameters.
         equal: number of parts that both have.
-        different: keys of parts that are not equal.
-        left_only: keys that the right dataset lacks.
-        right_only: keys that the left dataset lacks.
         returns: None where they are equal.
         observations: None where they are equal, or were not compared.
         first: why the first part that differs does; None if there is none, or it was not looked for.

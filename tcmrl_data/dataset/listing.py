@@ -168,11 +168,6 @@ def list_snapshots(dataset: Dataset) -> dict[str, Any]:
 def list_episodes(dataset: Dataset, *, task: int | None = None, step: int | None = None) -> dict[str, Any]:
     """Every episode: length, return, how it ended, and whether it succeeded at any step.
 
-    Args:
-        dataset: the dataset.
-        task: only this task.
-        step: only snapshots of this step.
-
     Raises:
         TaskError: the dataset does not hold the task.
         SelectionError: no part is left.
@@ -293,9 +288,6 @@ class ParameterShift:
 
     Attributes:
         parameter: what it is: the environment's ordering, or the dotted place of a number.
-        train: mean over the training tasks.
-        test: mean over the test tasks.
-        difference: test minus train.
         standardized: the difference in standard deviations of the training tasks; None where these are equal
             and the test tasks differ from them.
     """

@@ -76,8 +76,6 @@ class Selection:
     """Some tasks and snapshots of a dataset; a view, nothing is loaded.
 
     Attributes:
-        dataset: where it comes from.
-        tasks: the selected tasks.
         parts: task index to the keys of its selected parts.
         allow_test: training may use parts that were made from test tasks.
         rule: by which the parts were chosen, such as `all` or `tier:medium`.
@@ -257,7 +255,6 @@ class ViewFile(Record):
         """The manifest of a dataset that holds the view's parts alone.
 
         Args:
-            source: manifest of the source.
             tasks: indices of the source's recorded tasks.
         """
         runs = [run.model_copy(update={"steps": None}) for run in source.runs]

@@ -68,7 +68,6 @@ def dataset_card(dataset: Dataset, *, kept: str = "") -> str:
     """The card as Markdown, by the template `card.md.jinja`.
 
     Args:
-        dataset: the dataset or view.
         kept: Markdown of people, which stands below the summary between the marks.
     """
     manifest, summary, quality = dataset.manifest, dataset_summary(dataset), measure_quality(dataset)

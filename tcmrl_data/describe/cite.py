@@ -36,7 +36,6 @@ class Citation:
     Attributes:
         version: the first twelve digits of the dataset's root: equal data, equal version.
         licences: all that the data are under.
-        software: version of this package.
     """
 
     name: str

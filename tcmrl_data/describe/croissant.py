@@ -94,7 +94,6 @@ def croissant_document(dataset: Dataset, digests: Mapping[str, str]) -> dict[str
     """The JSON-LD of `croissant.json`.
 
     Args:
-        dataset: the dataset.
         digests: sha256 of the two tables, by file name.
     """
     manifest = dataset.manifest

@@ -85,8 +85,6 @@ def film(
     """Plays an episode again and takes pictures, evenly spread from its start to its end.
 
     Args:
-        environment: of its task.
-        episode: the episode.
         frames: most pictures.
         width: of the pictures in pixels; their height is three quarters of it.
         progress: called with steps done and steps in all.

@@ -54,16 +54,12 @@ class Content:
     """What was read and measured of a dataset.
 
     Attributes:
-        summary: of `dataset_summary`.
         returns: the document of `inspect returns --json`.
         tasks: the document of `inspect tasks --json`.
         shown: tasks that are drawn one by one.
         plane: in which states are drawn.
-        visits: states of the shown tasks.
-        actions: of all parts.
         endings: of the episodes of all parts, with their returns.
         paths: of the first, the middle and the last snapshot of the shown tasks.
-        browsed: whole episodes.
         transfer: None unless it was asked for; as `strips`.
     """
 
@@ -163,7 +159,6 @@ class Plane:
     """A projection of observations to the two coordinates in which a report draws states.
 
     Attributes:
-        names: of the coordinates.
         matrix: (observation_dim, 2).
         center: (observation_dim,), subtracted before.
         low: (2,), lower borders of what is drawn.
@@ -188,7 +183,6 @@ def choose_plane(dataset: Dataset, keys: Sequence[PartKey]) -> Plane:
     """The environment's plane, or that of two principal components of the standardized observations.
 
     Args:
-        dataset: the dataset.
         keys: of its parts, at least one; some rows of some are read.
     """
     states = np.concatenate([_sampled_states(dataset, key) for key in evenly_spread(keys, SAMPLED_PARTS)])
@@ -235,7 +229,6 @@ class StateVisits:
     Attributes:
         counts: by task: (BINS, BINS), rows along the second coordinate.
         outside: number of states beyond the plane's borders.
-        total: number of states.
     """
 
     def __init__(self, plane: Plane, tasks: Sequence[int]) -> None:
@@ -291,11 +284,7 @@ class StepEndings:
     """Episodes of one snapshot step.
 
     Attributes:
-        episodes: number of episodes.
-        terminated: episodes that the task ended.
-        truncated: episodes that the time limit ended.
         shortest, longest: steps of an episode.
-        steps: of all episodes.
         returns: number of episodes by return, in the bins of `EpisodeCounts.edges`.
     """
 
@@ -318,7 +307,6 @@ class EpisodeCounts:
 
     Attributes:
         edges: (RETURN_BINS + 1,) borders of the bins of returns.
-        by_step: counts by step.
     """
 
     def __init__(self, low: float, high: float) -> None:
@@ -367,10 +355,7 @@ class Browsed:
     """An episode to browse.
 
     Attributes:
-        key: of its part.
         number: its place in the part.
-        length: number of steps.
-        total: its undiscounted return.
         ended: how it ended: terminated, truncated, or cut where neither is stored.
         steps: (rows,) of the drawn steps.
         rewards: (rows,).

@@ -82,12 +82,9 @@ def render_episode(
     Every observation, reward and end must come back bit for bit, or nothing is written.
 
     Args:
-        path: a dataset or a view.
         out: file to write: `.webp` or `.mp4` for a film, `.png` for a strip of stills.
-        task: index of the task.
         step: snapshot step; the task's last one where None.
         episode: position in the part.
-        run: name of the run.
         frames: most pictures, evenly spread over the episode; 100 of a film and 5 of a strip where None.
         width: of a picture in pixels; its height is three quarters of it.
         progress: called with steps done and steps in all.

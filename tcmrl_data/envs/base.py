@@ -274,7 +274,6 @@ class Environment(abc.ABC):
 
         Args:
             task: made by `make` with the full view; it plays an episode while pictures are taken.
-            parameters: the task's parameters.
             width: width of a picture in pixels.
             height: height of a picture in pixels.
 
@@ -290,7 +289,6 @@ class Environment(abc.ABC):
 
         Args:
             axes: matplotlib's axes, which may show other tasks too.
-            parameters: the task's parameters.
             observations: (T + 1, observation_dim), stored view.
             color: the task's color for matplotlib.
 

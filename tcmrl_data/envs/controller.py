@@ -172,7 +172,6 @@ class NoisyController(_Wrapper):
 
     Args:
         controller: the controller; its own noise does not change.
-        sigma: standard deviation of the added noise.
         generators: generators of the added noise, one per lane.
     """
 
@@ -197,7 +196,6 @@ class BelievingController(_Wrapper):
     """Replaces what a controller observes of the task by the values of another task.
 
     Args:
-        controller: the controller.
         hidden: (observation_dim,) bool, the entries of full observations to replace.
         values: (observation_dim,), their new values.
     """

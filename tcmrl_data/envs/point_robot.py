@@ -281,10 +281,8 @@ def draw_task(
     """Draws start, goal and wind of a task, and the half circle if the goal lies on it.
 
     Args:
-        axes: where to draw.
         parameters: goal and wind of the task.
         reward_radius: distance to the goal within which there is a reward; None if it is everywhere.
-        color: of the goal.
     """
     from matplotlib.patches import Circle
 

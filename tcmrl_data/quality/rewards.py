@@ -61,12 +61,7 @@ class TaskRewards(MeasuredTask):
 
 
 class StageRewards(MeasuredStage):
-    """The rewards of a stage; `zero`, `silent`, `mean` are means over its parts.
-
-    Attributes:
-        parts: number of parts.
-        counts: number of rewards in every bin.
-    """
+    """The rewards of a stage; `zero`, `silent`, `mean` are means over its parts."""
 
     parts: int
     steps: int

@@ -63,7 +63,6 @@ class SnapshotQuality(MeasuredPart):
     """The quality of a part.
 
     Attributes:
-        mean: mean undiscounted return.
         tq: trajectory quality: 0 is as good as uniform actions, 1 as the best that is known of the task.
         tiers: the quality tiers that take the part.
     """
@@ -165,7 +164,6 @@ def bootstrap_interval(
     """The 95% percentile bootstrap interval of a statistic; None for both ends with fewer than FEWEST values.
 
     Args:
-        count: number of values.
         statistic: of resamples (resamples, count), which hold positions of values.
     """
     if count < FEWEST:
@@ -223,7 +221,6 @@ def plot_returns(dataset: Dataset, table: dict[str, Any], file: Path) -> None:
     """Draws the learning curves of all tasks, train and test apart, with oracle and uniform actions.
 
     Args:
-        dataset: where the references come from.
         table: what `list_returns` made.
         file: the picture to write; its ending names the format.
 

@@ -59,7 +59,6 @@ class Transfer(Measured):
     """Every last policy in every task: the document of `inspect transfer --json`.
 
     Attributes:
-        episodes: of a policy in a task.
         left_out: number of the dataset's tasks that take no part, because they are incomplete or too many.
         tasks: rows and columns, training tasks first.
         returns: row i, column j: mean return of the policy of task i in task j.
@@ -94,8 +93,6 @@ def measure_transfer(
         dataset: with its policies and an environment that is installed.
         tasks: most tasks that take part, evenly spread over both splits; None for 100, or 20 where a task is
             simulated.
-        episodes: of a policy in a task.
-        seed: of the episodes.
         deterministic: act without the policies' noise.
         progress: called with episodes done and episodes in all.
 

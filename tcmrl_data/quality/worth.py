@@ -104,7 +104,6 @@ class Worth(Measured):
     """Whether a context is worth having: the document of `inspect worth --json`.
 
     Attributes:
-        episodes: of a policy in a task.
         transitions: most transitions of a part that are predicted, and that predict.
         left_out: number of tasks that take no part.
         single_task: the training task whose policy does best in all training tasks.
@@ -134,9 +133,7 @@ def measure_worth(
     Args:
         dataset: with its policies and an environment that is installed.
         tasks: as in `measure_transfer`.
-        episodes: of a policy in a task.
         transitions: most transitions of a part that are predicted, and most that predict.
-        seed: of episodes and samples.
         progress: called with a stage, `playing` or `reading`, and its amounts done and in all: episodes, then
             parts.
 
@@ -185,9 +182,6 @@ def context_worth(transfer: Transfer) -> tuple[int, tuple[SplitWorth, ...]]:
 
     The policy is chosen by its mean return in the training tasks, its own one among them, and is the same for
     test tasks, whose own policies are never candidates.
-
-    Args:
-        transfer: every last policy in every task.
     """
     returns = np.array(transfer.returns)
     training = np.array([task.split == "train" for task in transfer.tasks])
@@ -271,10 +265,8 @@ def measure_visibility(
     Parts with fewer than two episodes are left out. Samples of the parts of one step are in memory.
 
     Args:
-        dataset: the dataset.
         tasks: the tasks; `measure_transfer` gives them.
         transitions: most transitions of a part that are predicted, and most that predict.
-        seed: of the samples.
         progress: called with parts done and parts in all.
 
     Raises:
@@ -334,7 +326,6 @@ def visibility(
     tasks, and where the other tasks predict without error.
 
     Args:
-        samples: one per task.
         generator: draws the transitions of other tasks.
     """
     if len(samples) < 2:

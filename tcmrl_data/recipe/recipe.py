@@ -308,7 +308,6 @@ def choose_tasks(
     A profile's tasks are evenly spaced along the environment's ordering, or by index if it has none.
 
     Args:
-        recipe: the recipe.
         indices: of the tasks; None for the profile's choice.
         environment: the recipe's, if it was made before.
 

@@ -28,7 +28,6 @@ class RecipeValue:
     """One value of a recipe.
 
     Attributes:
-        key: the key for `--set`.
         value: a JSON value; None if it is not set.
         source: the recipe's comment on the value's origin; empty if there is none.
     """

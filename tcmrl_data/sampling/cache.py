@@ -86,8 +86,6 @@ class CacheEntry:
         key: name of its file, without `.bin`.
         environment: name of the dataset's environment; empty if the entry is damaged.
         dataset: folder that it was decoded from; equal parts elsewhere share the entry. Empty if damaged.
-        tasks: number of selected tasks.
-        parts: number of selected parts.
         bytes: size on disk.
         used: Unix time of the last use.
         in_use: True if a process reads the entry.
@@ -137,7 +135,6 @@ def cached_rows(
     If another process decodes, this one waits; it decodes the rows itself if the other ends before.
 
     Args:
-        selection: the selection.
         dense: load dense rewards too; they have an entry of their own.
         say: called with a message before decoding, and before waiting, starts.
 

@@ -226,9 +226,7 @@ class Draws:
     The key of a kind's generator depends on the kind's name.
 
     Args:
-        episodes: the episodes.
         request: the content of a batch; a batch holds all tasks if there are fewer than requested.
-        sequence: seed sequence of the stream of batches.
     """
 
     def __init__(

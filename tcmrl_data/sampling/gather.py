@@ -186,7 +186,6 @@ class _Block:
     """Position of a kind in a buffer; does not depend on the number drawn for a batch.
 
     Attributes:
-        kind: the requested kind.
         view: (rows, floats) overlapping blocks of the table; row i is the block that starts at row i.
         offset: number of floats in front of the kind.
     """
@@ -205,9 +204,6 @@ class Gatherer:
     Args:
         rows: the packed selection.
         table: the table of the rows, in host memory or on the device.
-        request: the content of a batch.
-        num_tasks: tasks per batch.
-        device: device of the batches.
         endings: by rewards, for the kinds that are requested with `returns=True`.
     """
 

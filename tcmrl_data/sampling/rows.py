@@ -108,7 +108,6 @@ class PartRows:
 
     Attributes:
         task: position of the part's task in the selection.
-        episodes: number of the part's episodes.
     """
 
     dataset: "Dataset"
@@ -161,7 +160,6 @@ def fill_table(table: Table, plan: Sequence[PartRows], *, check_digests: bool = 
 
     Args:
         table: of the shape that `table_shape` gives.
-        plan: the parts.
         check_digests: compare the decoded arrays with the digests of the parts' records; for rows that others
             receive under the parts' ids.
 

@@ -47,10 +47,8 @@ def open_sampler(
 
     Args:
         selection: training tasks and snapshots.
-        request: the content of a batch.
         seed: seed of the run; batch n is a function of (seed, stream, n).
         stream: number of the stream; streams with the same seed are independent.
-        device: device of the batches.
         memory_limit: maximum size of the decoded steps in memory, in bytes; None for half of the available
             memory. Larger selections are decoded into the cache once and read from there.
         say: called with a message if the cache is used.
@@ -128,10 +126,6 @@ class Sampler:
 
     With a CUDA device, rows are stored on the device if they take at most half of its free memory;
     otherwise batches are gathered in page-locked memory and copied asynchronously.
-
-    Attributes:
-        request: the content of a batch.
-        device: device of the batches.
 
     Args:
         rows: the packed selection.

@@ -85,14 +85,7 @@ _ROOT = np.dtype([("task", "<u4"), ("step", "<u4"), ("run", "S64"), ("id", "V32"
 
 
 def part_entry(record: PartRecord, *, run: str, platform: int, archive: bytes) -> PartEntry:
-    """The line of a part.
-
-    Args:
-        record: the part's record.
-        run: name of the part's run.
-        platform: position of its platform in the manifest.
-        archive: the content of its file.
-    """
+    """The line of a part."""
     identity, statistics, references = record.identity, record.statistics, record.references
     return PartEntry(
         identity.task,

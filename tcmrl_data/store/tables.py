@@ -35,8 +35,6 @@ class PartKey(NamedTuple):
     """What a part is called within a dataset; keys are sorted by task, step and run.
 
     Attributes:
-        task: index of the task.
-        step: snapshot step.
         run: name of the run that the part belongs to.
     """
 
@@ -97,8 +95,6 @@ def check_plan(*, tasks: int, steps: int, columns: int, largest_task: int) -> No
     """Checks that a dataset will not become larger than readers allow.
 
     Args:
-        tasks: number of tasks.
-        steps: number of snapshot steps of every task.
         columns: width of observations or actions, whichever is larger.
         largest_task: bytes of the longest line of a task.
 
