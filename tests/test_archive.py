@@ -5,17 +5,13 @@ import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
-import tensorstore
-import zarr
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.store import archive as module
 from tcmrl_data.store.archive import MOST_MEMBERS, Archive, pack_archive
-from tcmrl_data.store.arrays import encode_arrays
 from tests.hostile.archives import FILES, FORGED, HONEST, INNER, START, forge, zipped
 
 names = st.from_regex(r"[a-z0-9_][a-z0-9_.]{0,5}(/[a-z0-9_][a-z0-9_.]{0,5}){0,3}", fullmatch=True)
@@ -200,21 +196,3 @@ def test_more_than_2_gib_are_refused_before_anything_is_copied() -> None:
     block = bytes(2**20)
     with pytest.raises(StoreError, match="at most 2147483648 bytes"):
         pack_archive({f"arrays/{index}": block for index in range(2**11)})
-
-
-def test_zarr_and_tensorstore_read_the_arrays_of_an_archive(path: Path) -> None:
-    random = np.random.default_rng(0)
-    arrays = {
-        "observations": random.normal(size=(30, 3)).astype(np.float32),
-        "terminated": np.eye(1, 29)[0] > 0,
-    }
-    path.write_bytes(pack_archive({**encode_arrays(arrays), "part.json": b"{}"}))
-    with zarr.storage.ZipStore(path, mode="r") as store:
-        group = zarr.open_group(store, path="arrays", mode="r")
-        assert sorted(group.array_keys()) == sorted(arrays)
-        for name, array in arrays.items():
-            assert np.array_equal(np.asarray(group[name]), array)
-    for name, array in arrays.items():
-        kvstore = {"driver": "zip", "base": f"file://{path}", "path": f"arrays/{name}/"}
-        other = tensorstore.open({"driver": "zarr3", "kvstore": kvstore}).result().read().result()
-        assert np.array_equal(other, array)

@@ -70,36 +70,6 @@ def test_a_missing_chunk_is_an_error_not_zeros(tmp_path: Path) -> None:
         assert read_arrays(archive, ["rewards"])["rewards"].tolist() == [1, 1, 1]
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("zarr_format", 2),
-        ("data_type", "float16"),
-        ("shape", [-1, 2]),
-        ("shape", [2**50, 2]),
-        ("attributes", {"x": 1}),
-        ("codecs", [{"name": "bytes", "configuration": {"endian": "little"}}, {"name": "gzip"}]),
-        ("chunk_grid", {"name": "regular", "configuration": {"chunk_shape": [0, 2]}}),
-        ("chunk_key_encoding", {"name": "v2"}),
-        ("storage_transformers", [{"name": "x"}]),
-        ("dimension_names", None),
-        ("dimension_names", ["step"]),
-        ("dimension_names", ["step", "observation"]),
-        ("surprise", 1),
-    ],
-)
-def test_metadata_outside_the_allow_list_is_refused(tmp_path: Path, field: str, value: object) -> None:
-    files = encode_arrays({"actions": np.ones((3, 2), dtype=np.float32)})
-    assert list(files) == ["arrays/actions/c/0/0", "arrays/actions/zarr.json", "arrays/zarr.json"]
-    metadata = "arrays/actions/zarr.json"
-    files[metadata] = json.dumps(json.loads(files[metadata]) | {field: value}).encode()
-    with (
-        written(tmp_path / "part.zip", files) as archive,
-        pytest.raises(StoreError, match=rf"part.zip: {metadata}: .*{field}"),
-    ):
-        read_arrays(archive, ["actions"])
-
-
 def test_every_array_names_its_axes(tiny: Dataset) -> None:
     with tiny.open_part(PART) as archive:
         names = {

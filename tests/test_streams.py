@@ -1,5 +1,6 @@
-"""Random streams of a batch: tasks and every kind have their own, keyed by the kind's name."""
+"""Draws of a batch: tasks and every kind have their own random streams; orders of episodes."""
 
+from collections import Counter
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ from hypothesis import strategies as st
 
 from tcmrl_data import Batch, BatchRequest, Trajectories, Transitions, Windows
 from tcmrl_data.foundation.errors import RequestError, SelectionError
+from tcmrl_data.sampling.draws import fill_places, places_filled, read_end
 from tests.sampling import numbered_tasks, sampler_of
 
 LENGTHS = [[5, 9, 4, 7, 6, 8], [4, 8, 8, 6, 5, 5, 7], [10, 4, 5, 7, 6, 9, 4, 5]]
@@ -136,3 +138,41 @@ def test_numbers_outside_their_range_are_refused(change: dict[str, Any]) -> None
 def test_a_task_that_holds_too_little_is_named(kinds: dict[str, Any], message: str) -> None:
     with pytest.raises(SelectionError, match=message):
         sampler_of(numbered_tasks([[3, 3], [2]]), BatchRequest(tasks=2, kinds=kinds))
+
+
+@given(st.lists(st.integers(1, 9), min_size=1, max_size=4), st.data())
+def test_both_ends_belong_to_one_order_whatever_their_numbers(counts: list[int], data: st.DataObject) -> None:
+    """Draws of an end do not repeat, the ends are disjoint, and neither depends on the other's number."""
+    front = data.draw(st.integers(0, min(counts)))
+    back = data.draw(st.integers(0, min(counts) - front))
+    seed = data.draw(st.integers(0, 100))
+    sizes = np.array(counts)
+
+    def read(number: int, *, from_back: bool, places: int) -> list[list[int]]:
+        uniform = np.random.default_rng(seed).random((places, len(sizes)))
+        filled = fill_places(sizes, uniform)
+        found: list[list[int]] = read_end(filled, sizes, number, from_back=from_back).tolist()
+        return found
+
+    needed = [places_filled(front, from_back=False), places_filled(back, from_back=True)]
+    fronts = read(front, from_back=False, places=max(needed))
+    backs = read(back, from_back=True, places=max(needed))
+    for size, one, other in zip(counts, fronts, backs, strict=True):
+        assert len({*one, *other}) == front + back
+        assert all(0 <= episode < size for episode in (*one, *other))
+    assert fronts == read(front, from_back=False, places=min(needed[0], max(counts)))
+    assert backs == read(back, from_back=True, places=min(needed[1], max(counts)))
+    whole = read(min(counts), from_back=False, places=2 * max(counts))
+    assert [order[:front] for order in whole] == fronts
+
+
+def test_every_order_is_equally_likely() -> None:
+    num_orders = 240_000
+    counts = np.full(num_orders, 4)
+    filled = fill_places(counts, np.random.default_rng(0).random((4, num_orders)))
+    orders = read_end(filled, counts, 4, from_back=False)
+    assert (orders == read_end(filled, counts, 4, from_back=True)[:, ::-1]).all()
+    found = np.array(list(Counter(map(tuple, orders.tolist())).values()))
+    assert len(found) == 24
+    statistic = (np.square(found - 10_000) / 10_000).sum()
+    assert statistic < 23 + 4 * np.sqrt(2 * 23)
