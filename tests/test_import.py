@@ -106,7 +106,7 @@ def test_data_of_one_of_our_environments_are_bound_to_it(
     found = imported(exported, tmp_path / "data", environment="point-robot")
     assert found.name == "point-robot"
     assert found.environment.lanes([found.tasks[0].parameters]).num_lanes == 1
-    with pytest.raises(StoreError, match="2 columns of observations, half-cheetah-vel has"):
+    with pytest.raises(StoreError, match=r"\(2, 2, 20\), those of half-cheetah-vel \(17, 6, 200\)"):
         import_dataset("hdf5", exported, tmp_path / "other", environment="half-cheetah-vel")
     assert not (tmp_path / "other").exists()
 

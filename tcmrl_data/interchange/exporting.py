@@ -20,7 +20,7 @@ from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import canonical_json, digest
+from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import (
     disk,
     lock_file,
@@ -38,7 +38,7 @@ from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.foundation.plugins import Registry
 from tcmrl_data.interchange.reader import EPISODE_ARRAYS, FORMAT_VERSION
 from tcmrl_data.recipe.document import AND
-from tcmrl_data.store.tables import PartKey, task_line
+from tcmrl_data.store.tables import PartKey
 
 REMEDY = "nothing was exported; make room or choose an --out on another disk, then export again"
 FILE_BYTES = 2**16
@@ -289,7 +289,10 @@ def _write(
 ) -> None:
     """Writes the tasks that no earlier attempt has finished."""
     total, done = sum(map(len, selection.parts.values())), 0
-    with _staged(out, _claim(exporter, selection)) as staged:
+    # what the files follow from; the manifest seals the tasks and the parts
+    chosen = [selection.rule, [task.index for task in selection.tasks], [*selection.parts.values()]]
+    made_by = [exporter.name, version("tcmrl"), selection.dataset.manifest.digest]
+    with _staged(out, canonical_json([*made_by, *chosen])) as staged:
         for task in selection.tasks:
             name = exporter.place(selection, task)
             if (staged / FINISHED / name).exists():
@@ -305,20 +308,6 @@ def _write(
                         progress(done, total)
         for name, content in exporter.accompanying(selection).items():
             replace_file(staged / FINISHED / name, content, staging=staged / OPEN)
-
-
-def _claim(exporter: Format, selection: Selection) -> bytes:
-    """What an export's files follow from: format, package, tasks and parts."""
-    ids = [[*key, selection.dataset.entry(key).id] for keys in selection.parts.values() for key in keys]
-    return canonical_json(
-        {
-            "format": exporter.name,
-            "package": version("tcmrl"),
-            "dataset": digest([selection.dataset.manifest.digest, selection.rule]),
-            "tasks": digest([task_line(task).decode() for task in selection.tasks]),
-            "parts": digest(ids),
-        }
-    )
 
 
 @contextlib.contextmanager

@@ -135,7 +135,20 @@ def import_dataset(
             raise StoreError(f"{path}: {error}") from None
     known = survey.tasks if tasks is None else survey.tasks | _tasks_of_file(Path(tasks))
     imported = {index: known[index] for index in sorted(survey.tasks)}
-    recipe, extras = _recipe_of(survey, [*imported.values()], environment=environment, licence=licence)
+    check_plan(
+        tasks=len(imported),
+        steps=max(Counter(key.task for key in survey.keys).values()),
+        columns=max(survey.sizes),
+        largest_task=max(len(task_line(task)) for task in imported.values()),
+    )
+    recipe, extras = recipe_of_episodes(
+        environment,
+        tasks=[*imported.values()],
+        sizes=survey.sizes,
+        horizon=survey.horizon,
+        extras=survey.extras or {},
+        licence=licence,
+    )
     report = ImportReport(
         out=Path(out),
         environment=recipe.environment.name,
@@ -271,47 +284,46 @@ class _Source:
                 yield path, index, part
 
 
-def _recipe_of(
-    survey: _Survey, tasks: Sequence[Task], *, environment: str | None, licence: str | None
+def recipe_of_episodes(
+    environment: str | None,
+    *,
+    tasks: Sequence[Task],
+    sizes: tuple[int, int],
+    horizon: int,
+    extras: Mapping[str, str],
+    licence: str | None,
 ) -> tuple[Recipe, list[str]]:
-    """The recipe of an import, and the further arrays that its parts keep.
+    """The recipe of episodes that another program has made, and the further arrays that their parts keep.
+
+    Args:
+        environment: one of ours that they come from; None gives the environment `foreign`.
+        tasks: of the dataset.
+        sizes: widths of observations and actions.
+        horizon: most steps of an episode.
+        extras: dtypes of the further arrays by their names.
+        licence: of the data.
 
     Raises:
         StoreError: the episodes do not fit the environment.
-        BuildError: the dataset would exceed a limit.
     """
-    extras = survey.extras or {}
-    check_plan(
-        tasks=len(tasks),
-        steps=max(Counter(key.task for key in survey.keys).values()),
-        columns=max(survey.sizes),
-        largest_task=max(len(task_line(task)) for task in tasks),
-    )
     if environment is None:
         recipe = foreign_recipe(
             tasks=len(tasks),
             train=sum(task.split == "train" for task in tasks),
-            horizon=survey.horizon,
-            observation_dim=survey.sizes[0],
-            action_dim=survey.sizes[1],
+            horizon=horizon,
+            observation_dim=sizes[0],
+            action_dim=sizes[1],
             extra_arrays=extras,
             licence=licence,
         )
         return recipe, list(extras)
     recipe = bound_recipe(environment, licence=licence)
     made = recipe.make_environment()
-    for what, found, wanted in zip(
-        ("observations", "actions"), survey.sizes, (made.observation_dim, made.action_dim), strict=True
-    ):
-        if found != wanted:
-            raise StoreError(
-                f"the files have {found} columns of {what}, {environment} has {wanted}; name another "
-                "environment"
-            )
-    if survey.horizon > made.settings.horizon:
+    wanted, longest = (made.observation_dim, made.action_dim), made.settings.horizon
+    if sizes != wanted or horizon > longest:
         raise StoreError(
-            f"the files have an episode of {survey.horizon} steps, the horizon of {environment} is "
-            f"{made.settings.horizon}; name another --environment or none"
+            f"observations, actions and horizon are {(*sizes, horizon)}, those of {environment} "
+            f"{(*wanted, longest)}; name another environment or none"
         )
     types = {name: str(np.dtype(dtype)) for name, dtype in made.extras.items()}
     return recipe, [name for name, dtype in extras.items() if types.get(name) == dtype]

@@ -16,14 +16,15 @@ from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.interchange.importing import recipe_of_episodes
 from tcmrl_data.interchange.reader import EpisodeCuts, episode_of
 from tcmrl_data.operations.assembly import derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
-from tcmrl_data.recipe.imported import bound_recipe, check_licence, foreign_recipe
+from tcmrl_data.recipe.imported import check_licence
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
-from tcmrl_data.store.manifest import Manifest, Run
+from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part import DATA_VERSION, STANDARD_ARRAYS, PartRecord
 from tcmrl_data.store.tables import MAIN_RUN, PartKey, key_of_file, part_folder
 
@@ -87,24 +88,17 @@ class DatasetRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
         if part_episodes < 1:
             raise StoreError(f"part_episodes must be 1 or more, got {part_episodes}")
         check_licence(licence)
-        observation_dim, action_dim = _sizes(env)
         self._horizon = _horizon(env, horizon)
-        self._recipe = (
-            bound_recipe(environment, licence=licence)
-            if environment is not None
-            else foreign_recipe(
-                tasks=1,
-                train=int(split == "train"),
-                horizon=self._horizon,
-                observation_dim=observation_dim,
-                action_dim=action_dim,
-                extra_arrays={},
-                licence=licence,
-            )
-        )
-        _check_bound(self._recipe.make_environment(), observation_dim, action_dim, self._horizon)
         self._out, self._part_episodes, self._label = Path(out), part_episodes, label
         self._task = Task(task, split, dict(parameters or {}))
+        self._recipe, _ = recipe_of_episodes(
+            environment,
+            tasks=[self._task],
+            sizes=_sizes(env),
+            horizon=self._horizon,
+            extras={},
+            licence=licence,
+        )
         name = None if env.spec is None else env.spec.id
         origin = {"format": "recording", "environment": name, "licence": licence, "url": url}
         self._run = Run(
@@ -175,19 +169,15 @@ class DatasetRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             self._end_episode(terminated=False, truncated=True)
             self._publish()
             if self._published_episodes:
-                self._finish()
+                self._assembly.finish(
+                    name=self._recipe.environment.name,
+                    data_version=DATA_VERSION,
+                    runs=[self._run],
+                    tasks=[self._task],
+                    label=self._label,
+                )
+                remove_tree(self._out / CHECKPOINTS)
         self.env.close()
-
-    def _finish(self) -> Manifest:
-        manifest = self._assembly.finish(
-            name=self._recipe.environment.name,
-            data_version=DATA_VERSION,
-            runs=[self._run],
-            tasks=[self._task],
-            label=self._label,
-        )
-        remove_tree(self._out / CHECKPOINTS)
-        return manifest
 
     def _take_up(self) -> None:
         """Counts the parts and reads the open part's finished episodes that an earlier attempt left."""
@@ -284,14 +274,3 @@ def _horizon(env: gymnasium.Env[Any, Any], horizon: int | None) -> int:
             f"the environment has no time limit ({found}); pass horizon=N, the most steps of an episode"
         )
     return found
-
-
-def _check_bound(environment: Any, observation_dim: int, action_dim: int, horizon: int) -> None:
-    """Compares the wrapped environment with the one that the dataset will name."""
-    found = (observation_dim, action_dim, horizon)
-    wanted = (environment.observation_dim, environment.action_dim, environment.settings.horizon)
-    if found[:2] != wanted[:2] or horizon > wanted[2]:
-        raise StoreError(
-            f"observations, actions and horizon are {found}, those of {environment.name} {wanted}; leave out "
-            "environment=NAME or name another"
-        )
