@@ -126,7 +126,7 @@ def experiment(
       tcmrl experiment table2 --tuned tuning --reuse results/figure4_point_robot
       tcmrl experiment mine.toml --data /disk/datasets --only TCMRL --only FOCAL
     """
-    from tcmrl_algo import load_experiment, run_experiment, tuned_settings
+    from tcmrl_algo import load_experiment, run_experiment
     from tcmrl_data import parse_indices
 
     if as_list:
@@ -139,6 +139,11 @@ def experiment(
     loaded = loaded if profile is None else loaded.at_profile(profile)
     if build:
         _build(loaded, environments, data=data, workers=workers, quiet=quiet)
+    settings = None
+    if tuned is not None:
+        from tcmrl_algo import tuned_settings
+
+        settings = tuned_settings(loaded, tuned, environments=environments, only=only)
     with stopped_by_signals(lambda: same_command(out)):
         report = run_experiment(
             loaded,
@@ -150,7 +155,7 @@ def experiment(
             steps=steps,
             workers=workers,
             device=device,
-            tuned=tuned_settings(loaded, tuned, environments=environments, only=only) if tuned else None,
+            tuned=settings,
             reuse=reuse,
             report=lambda *ended: remark(_line(*ended), quiet=quiet),
         )

@@ -25,10 +25,11 @@ from .algorithms.core.problem import Problem as Problem
 from .algorithms.core.problem import Stage as Stage
 from .algorithms.core.problem import StagePlan as StagePlan
 from .algorithms.core.problem import pad_trajectories as pad_trajectories
+from .algorithms.core.settings import TrainingConfig as TrainingConfig
 from .algorithms.core.settings import TrainingSettings as TrainingSettings
-from .experiment.plan import MissingDataset as MissingDataset
-from .experiment.plan import build_missing as build_missing
-from .experiment.plan import missing_datasets as missing_datasets
+from .experiment.datasets import MissingDataset as MissingDataset
+from .experiment.datasets import build_missing as build_missing
+from .experiment.datasets import missing_datasets as missing_datasets
 from .experiment.results import RunResult as RunResult
 from .experiment.run import ExperimentReport as ExperimentReport
 from .experiment.run import run_experiment as run_experiment
@@ -52,7 +53,6 @@ from .report.write import write_report as write_report
 from .training.checkpoint import Run as Run
 from .training.checkpoint import RunRecord as RunRecord
 from .training.checkpoint import open_run as open_run
-from .training.config import TrainingConfig as TrainingConfig
 from .training.config import resolve as resolve
 from .training.config import resolve_for as resolve_for
 from .training.train import TrainingProgress as TrainingProgress

@@ -16,9 +16,9 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import METHODS, experiment_names, load_experiment, open_run, run_experiment, train_run
+from tcmrl_algo.experiment.job import code_commit, run_job
 from tcmrl_algo.experiment.plan import plan_runs, resolve_method
 from tcmrl_algo.experiment.results import RunResult, read_result, read_results
-from tcmrl_algo.experiment.run import code_commit, run_job
 from tcmrl_algo.experiment.spec import Experiment, read_experiment
 from tcmrl_data import SelectionError, TcmrlError, TrainingError
 from tcmrl_data.foundation.machine import available_cores, processor

@@ -10,8 +10,9 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import load_experiment, run_experiment, write_report
-from tcmrl_algo.experiment import plan
-from tcmrl_algo.experiment.plan import missing_datasets, plan_runs
+from tcmrl_algo.experiment import datasets
+from tcmrl_algo.experiment.datasets import missing_datasets
+from tcmrl_algo.experiment.plan import plan_runs
 from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.experiment.spec import Experiment, read_experiment
 from tcmrl_data import SelectionError, TrainingError
@@ -126,7 +127,7 @@ def test_build_makes_what_is_missing_and_then_runs(
     tmp_path: Path, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """By the recipe of the profile, but for fewer steps and episodes."""
-    monkeypatch.setattr(plan, "load_recipe", functools.partial(tcmrl_data.load_recipe, overrides=TINY))
+    monkeypatch.setattr(datasets, "load_recipe", functools.partial(tcmrl_data.load_recipe, overrides=TINY))
     content = experiments.tables(tmp_path / "data", seeds=[0], claims=[])
     content["methods"] = {"A": {"algorithm": "no_context"}}
     file = experiments.write_file(tmp_path / "small.toml", content)

@@ -4,6 +4,7 @@ import ast
 import importlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -19,6 +20,7 @@ import tcmrl_data
 from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.algorithms.tcmrl import sparsity_loss
 from tcmrl_data.envs.base import ENVIRONMENTS
+from tests import experiments
 from tests.plugin_packages import install
 
 ROOT = Path(__file__).parents[1]
@@ -51,6 +53,7 @@ LOOKS = (
     "tcmrl-data inspect coverage data/point-robot",
     "tcmrl-data inspect rewards data/point-robot",
     "tcmrl-data export data/point-robot --format hdf5 --out out",
+    "tcmrl experiment small.toml --out results",
 )
 PLOT = "tcmrl-data inspect returns data/point-robot --plot returns.png"
 
@@ -101,11 +104,13 @@ class Done:
 
 
 @pytest.fixture(scope="module")
-def done(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Done]:
+def done(tiny_folder: Path, small_results: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Done]:
     """Imports and commands, done in this order in one fresh interpreter; what loads something comes last."""
     place = tmp_path_factory.mktemp("place")
     (place / "data").mkdir()
     (place / "data" / "point-robot").symlink_to(tiny_folder)
+    experiments.write_file(place / "small.toml", experiments.tables(tiny_folder))
+    shutil.copytree(small_results, place / "results")
     declares = {"tcmrl.engines": "cloud = users_engine:Cloud"}
     modules = {"users_engine": "raise RuntimeError('imported')"}
     install(place / "site", "users-package", modules=modules, declares=declares)
@@ -126,7 +131,7 @@ def done(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[st
 
 
 @pytest.mark.parametrize("line", LOOKS)
-def test_looking_at_data_loads_nothing_heavy(line: str, done: dict[str, Done]) -> None:
+def test_looking_at_data_and_finished_work_loads_nothing_heavy(line: str, done: dict[str, Done]) -> None:
     assert done[line].modules & HEAVY == set()
 
 

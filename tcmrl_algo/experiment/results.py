@@ -13,8 +13,8 @@ from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_algo.experiment.spec import Experiment, run_id
-from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_data import CheckpointError
 from tcmrl_data.foundation.disk import make_folders, replace_file
 from tcmrl_data.foundation.records import read_record
@@ -41,6 +41,8 @@ COLUMNS = (
 )
 AGAIN = "; delete it, and the run is done again"
 """What helps against a broken result."""
+DIVERGED = "diverged"
+"""Instead of a digest, where training diverged; the run's `error.txt` says how."""
 DIGITS = 6
 """Significant digits of a float in a table or a compact result; reports print four."""
 YES = "yes"
@@ -96,6 +98,10 @@ class Tuned(_Record):
     seeds: tuple[int, ...]
     score: float
     overrides: tuple[str, ...]
+
+
+TunedSettings = Mapping[str, Mapping[str, Tuned]]
+"""Tuned settings by environment and algorithm."""
 
 
 class ContextMeasures(_Record):

@@ -1,54 +1,38 @@
 """Runs an experiment: skips finished runs, resumes killed ones, several at once, and writes one table.
 
-A run is a worker process, which gets a JSON job on standard input. It trains up to the
-next point of the learning curve, evaluates there, writes the point down, and so on; a killed one goes on from
-the newest checkpoint and ends in the same tensors.
+A call that has nothing to do says so without importing torch, which takes longer than all the rest.
 """
 
 import contextlib
-import importlib.metadata
-import subprocess
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
+from pydantic import BaseModel, ConfigDict
 
-from tcmrl_algo.adaptation.evaluate import evaluate_run
-from tcmrl_algo.algorithms.core.settings import EVALUATION_KEYS, LOGGING_KEYS
-from tcmrl_algo.experiment.plan import TunedSettings, check_same, completed, plan_runs, with_threads
+from tcmrl_algo.experiment.datasets import open_datasets
 from tcmrl_algo.experiment.results import (
-    Curve,
-    CurvePoint,
+    DIVERGED,
     Job,
     RunResult,
-    RunSpec,
-    SharedTraining,
+    TunedSettings,
     error_file,
     read_result,
     read_results,
-    result_file,
     table_text,
 )
-from tcmrl_algo.experiment.spec import Experiment, experiment_of
-from tcmrl_algo.training.checkpoint import open_run, tensors_digest, write_run
-from tcmrl_algo.training.config import stage_plan
-from tcmrl_algo.training.train import TrainingProgress, resume_run, train_run, usable_device
-from tcmrl_data import CheckpointError, Dataset, TrainingError, open_dataset
+from tcmrl_algo.experiment.spec import Experiment
+from tcmrl_data import TrainingError
 from tcmrl_data.engine.base import BaseEngine, Unit, make_engine
-from tcmrl_data.engine.worker import Send
+from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import lock_file, make_folders, replace_file
-from tcmrl_data.foundation.errors import DivergenceError
-from tcmrl_data.foundation.machine import available_cores, processor
+from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.foundation.records import read_record, write_record
 
-WORKER = "tcmrl_algo.experiment.run"
-CODE = Path(__file__).parents[2]
-MEANS = ("final", "regret", "normalized", "shuffled")
-DIVERGED = "diverged"
-"""Instead of a digest, where training diverged; the run's `error.txt` says how."""
+WORKER = "tcmrl_algo.experiment.job"
+PACKAGE = Path(__file__).parents[1]
 
 Report = Callable[[RunResult | str, int, int, float | None], None]
 """Receives a run as it ends, or `run: reason` where it failed; how many have ended, of how many; and the
@@ -122,6 +106,30 @@ def run_experiment(
         >>> run_experiment(experiment, "results/perspectives", workers=2).results  # doctest: +SKIP
     """
     began, out, cores = time.perf_counter(), Path(out), available_cores()
+    call = {
+        "experiment": experiment.to_json(),
+        "only": list(only),
+        "environments": list(environments),
+        "seeds": None if seeds is None else list(seeds),
+        "steps": steps,
+        "overrides": list(overrides),
+        "tuned": None
+        if tuned is None
+        else {
+            name: {algorithm: one.model_dump(mode="json") for algorithm, one in settings.items()}
+            for name, settings in tuned.items()
+        },
+    }
+    datasets = open_datasets(experiment.on(environments), Path(data))
+    call["roots"] = {name: dataset.manifest.root for name, dataset in datasets.items()}
+    if (names := _nothing_to_do(out, call)) is not None:
+        results = tuple(read_result(out / "runs" / name) for name in names)
+        return ExperimentReport(out, results, len(results), (), {}, time.perf_counter() - began)
+
+    from tcmrl_algo.experiment.job import finished_trainings, take_over
+    from tcmrl_algo.experiment.plan import plan_runs
+    from tcmrl_algo.training.train import usable_device
+
     usable_device(device)
     workers = workers or cores
     every = plan_runs(
@@ -167,8 +175,51 @@ def run_experiment(
             is_known = done - present >= min(workers, len(jobs))
             if report is not None:
                 report(ended, done, len(plan), pace * (len(plan) - done) if is_known else None)
+        if not failed:
+            write_record(out / LAST_CALL, LastCall(state=_state(out, call), runs=tuple(found)))
     results = tuple(result for result in found.values() if result is not None)
     return ExperimentReport(out, results, present, tuple(failed), diverged, time.perf_counter() - began)
+
+
+class LastCall(BaseModel):
+    """`last_call.json` of a results folder: of a call that left nothing to do.
+
+    Attributes:
+        state: digest of what it was asked, of this package's files and of the results.
+        runs: ids, in the order of the plan.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    state: str
+    runs: tuple[str, ...]
+
+
+LAST_CALL = "last_call.json"
+
+
+def _nothing_to_do(out: Path, call: Mapping[str, Any]) -> tuple[str, ...] | None:
+    """The finished runs, if the last call was the same and neither results nor code were changed since."""
+    file = out / LAST_CALL
+    if not file.is_file():
+        return None
+    last = read_record(LastCall, file, remedy="; delete it")
+    return last.runs if last.state == _state(out, call) else None
+
+
+def _state(out: Path, call: Mapping[str, Any]) -> str:
+    files = {
+        str(file.relative_to(folder)): [file.stat().st_size, file.stat().st_mtime_ns]
+        for folder, pattern in (
+            (out, "*.json"),
+            (out, "table.csv"),
+            (out, "runs/*.json"),
+            (PACKAGE, "**/*.py"),
+        )
+        for file in folder.glob(pattern)
+        if file.name != LAST_CALL
+    }
+    return digest([dict(call), files])
 
 
 def _chosen(plan: Sequence[Job], experiment: Experiment, only: Sequence[str]) -> list[Job]:
@@ -190,6 +241,8 @@ def _finished(plan: Sequence[Job], out: Path, experiment: Experiment) -> dict[st
     Raises:
         CheckpointError: one of them differs from the planned runs in more than its seed.
     """
+    from tcmrl_algo.experiment.plan import check_same
+
     planned = {(job.environment, job.method, job.fold): job.identity for job in plan}
     found = {}
     for result in read_results(out, experiment):
@@ -207,6 +260,8 @@ def _begun(job: Job) -> Job:
     Raises:
         CheckpointError: it was begun with other settings or data.
     """
+    from tcmrl_algo.experiment.plan import check_same, with_threads
+
     folder = Path(job.folder)
     if not ((folder / "run.json").is_file() and (folder / "job.json").is_file()):
         return job
@@ -240,200 +295,3 @@ def _run(jobs: dict[str, Job], engine: BaseEngine) -> Iterator[tuple[str, str | 
 def _write_table(out: Path, experiment: Experiment) -> None:
     rows = [row for result in read_results(out, experiment) for row in result.rows()]
     replace_file(out / "table.csv", table_text(rows).encode())
-
-
-def finished_trainings(folders: Iterable[str | Path]) -> list[RunResult]:
-    """The finished runs in results folders that still have their tensors.
-
-    Raises:
-        CheckpointError: no experiment was run in one of the folders.
-    """
-    return [
-        result.model_copy(update={"identity": completed(result.identity)})
-        for folder in map(Path, folders)
-        for result in read_results(folder, experiment_of(folder))
-        if result.identity and result.folder is not None and (result.folder / "run.json").is_file()
-    ]
-
-
-def take_over(job: Job, trained: Sequence[RunResult]) -> Job:
-    """The job with the tensors of an equal training in its folder; the job itself where there is none.
-
-    Trainings are equal if dataset root, test tasks, seed, steps, device and all settings are, but for those
-    that only evaluation or logging read; settings that are newer than a training have their defaults there.
-    The code is taken to be the same. A learning curve is taken over
-    only from a run with points at the same steps, evaluated in the same way.
-    """
-    folder = Path(job.folder)
-    if (folder / "run.json").is_file():
-        return job
-    for result in trained:
-        if _training_of(result.identity) != _training_of(job.identity) or result.device != job.device:
-            continue
-        assert result.folder is not None
-        evaluated_alike = _evaluation_of(result.identity) == _evaluation_of(job.identity)
-        points = {point.step: point for point in result.curve}
-        *steps, last = job.points()
-        is_curve_alike = evaluated_alike and job.protocols[:1] == tuple(result.evaluations)[:1]
-        run = open_run(result.folder)
-        if (steps and not (is_curve_alike and points.keys() >= set(steps))) or run.newest().step != last:
-            continue
-        config = with_threads(job.config, result.threads)
-        write_record(folder / "curve.json", Curve(points=tuple(points[step] for step in steps)))
-        copied = write_run(folder, run.record.model_copy(update={"config": config, "dataset": job.dataset}))
-        copied.save(last, run.newest().tensors())
-        shared = SharedTraining(
-            training_of=f"{result.experiment}, {result.method}",
-            training_seconds=result.training_seconds,
-            peak_memory=result.peak_memory,
-            evaluations=result.evaluations if evaluated_alike else {},
-        )
-        return job.model_copy(update={"config": config, "shared": shared})
-    return job
-
-
-def _training_of(identity: dict[str, Any]) -> dict[str, Any]:
-    """What the tensors of a run are a function of."""
-    tables = identity["training"]
-    run = {key: value for key, value in tables["run"].items() if key not in EVALUATION_KEYS | LOGGING_KEYS}
-    shared = {key: identity[key] for key in ("root", "test_tasks", "seed")}
-    return shared | {"training": tables | {"run": run}}
-
-
-def _evaluation_of(identity: dict[str, Any]) -> dict[str, Any]:
-    """What an evaluation is a function of, beside tensors and protocol."""
-    run = identity["training"]["run"]
-    return {key: run[key] for key in EVALUATION_KEYS - {"protocol"}}
-
-
-def run_job(job: Job, report: Send) -> str:
-    """Does a run, or what is missing of it; the digest of its tensors.
-
-    Raises:
-        TcmrlError: it cannot be trained or evaluated.
-    """
-    folder, dataset = Path(job.folder), open_dataset(job.dataset)
-    if dataset.manifest.root != job.root:
-        raise CheckpointError(f"{job.dataset} was changed after this experiment began; start it anew")
-    file = folder / "curve.json"
-    curve = read_record(Curve, file).points if file.is_file() else ()
-    shared = {} if job.shared is None else job.shared.evaluations
-    evaluations: dict[str, dict[str, Any]] = {}
-    stages = stage_plan(job.config)
-    for step in job.points()[len(curve) :]:
-        timed_steps, seconds = _train_to(step, job, dataset, report)
-        began = time.perf_counter()
-        is_last = step == job.points()[-1]
-        evaluations = {
-            protocol: shared[protocol]
-            if is_last and protocol in shared
-            else evaluate_run(
-                folder, protocol=protocol, dataset_path=job.dataset, repeats=None if is_last else 1
-            ).to_json()
-            for protocol in (job.protocols if is_last else job.protocols[:1])
-        }
-        first = evaluations[job.protocols[0]]
-        point = CurvePoint(
-            step=step,
-            stage=stages.at(step).stage,
-            **{name: first[f"mean_{name}"] for name in MEANS},
-            timed_steps=timed_steps,
-            seconds=seconds,
-            evaluation_seconds=time.perf_counter() - began,
-            peak_memory=_peak_memory(),
-            device_memory=torch.cuda.max_memory_allocated() if torch.cuda.is_available() else 0,
-        )
-        curve = (*curve, point)
-        if step < job.points()[-1]:
-            write_record(file, Curve(points=curve))
-    result = _result(job, dataset, curve, evaluations)
-    write_record(result_file(folder), result)
-    return result.digest
-
-
-def _train_to(step: int, job: Job, dataset: Dataset, report: Send) -> tuple[int, float]:
-    """Trains up to a step; how many steps that took here, and how long."""
-    folder = Path(job.folder)
-    is_begun = (folder / "run.json").is_file()
-    checkpoints = open_run(folder).checkpoints() if is_begun else []
-    start = reported = checkpoints[-1].step if checkpoints else 0
-    if start == step:
-        return 0, 0.0
-
-    def show(progress: TrainingProgress) -> None:
-        nonlocal reported
-        report({"kind": "steps", "count": progress.step - reported})
-        reported = progress.step
-
-    if is_begun:
-        return step - start, resume_run(folder, dataset, steps=step, report=show).seconds
-    done = train_run(
-        dataset,
-        folder,
-        config=job.config,
-        profile=job.profile,
-        seed=job.seed,
-        steps=step,
-        device=job.device,
-        report=show,
-    )
-    return step, done.seconds
-
-
-def _result(
-    job: Job, dataset: Dataset, curve: tuple[CurvePoint, ...], evaluations: dict[str, dict[str, Any]]
-) -> RunResult:
-    run = open_run(job.folder)
-    timed, seconds = sum(point.timed_steps for point in curve), sum(point.seconds for point in curve)
-    steps, shared = run.record.steps, job.shared
-    memory = max(point.device_memory or point.peak_memory for point in curve)
-    return RunResult(
-        **{name: getattr(job, name) for name in RunSpec.model_fields if name not in ("config", "device")},
-        algorithm=job.config.settings.run.algorithm,
-        privileged=run.record.privileged,
-        steps=steps,
-        device=run.record.device,
-        threads=run.record.config.settings.run.threads,
-        config=run.record.config,
-        versions=run.record.versions | {"tcmrl": importlib.metadata.version("tcmrl")},
-        digest=tensors_digest(run.newest().tensors()),
-        curve=curve,
-        evaluations=evaluations,
-        training_seconds=shared.training_seconds if shared else seconds * steps / timed if timed else None,
-        evaluation_seconds=sum(point.evaluation_seconds for point in curve),
-        peak_memory=shared.peak_memory if shared else memory,
-        training_of=shared.training_of if shared else None,
-        behavior_seed=dataset.manifest.seed,
-        commit=code_commit(),
-        processor=torch.cuda.get_device_name() if run.record.device.startswith("cuda") else processor(),
-    )
-
-
-def code_commit() -> str | None:
-    """The commit of this package's code, as `RunResult.commit`."""
-    if not (CODE / ".git").exists():
-        return None
-    describe = ["git", "describe", "--always", "--dirty", "--abbrev=12", "--exclude=*"]
-    try:
-        found = subprocess.run(describe, cwd=CODE, capture_output=True, text=True, check=True)
-    except (OSError, subprocess.CalledProcessError):
-        return None
-    return found.stdout.strip()
-
-
-def _peak_memory() -> int:
-    """Bytes that this process held at most; Linux keeps count (`getrusage` would count the driver's too)."""
-    for line in Path("/proc/self/status").read_text(encoding="ascii").splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024
-    return 0
-
-
-def work(spec: dict[str, Any], report: Send) -> str:
-    """Does the run of a job in JSON; the digest of its tensors, or `DIVERGED`."""
-    job = Job.model_validate(spec)
-    try:
-        return run_job(job, report)
-    except DivergenceError as error:
-        replace_file(error_file(Path(job.folder)), f"{error}\n".encode())
-        return DIVERGED

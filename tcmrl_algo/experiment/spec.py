@@ -4,7 +4,7 @@ import importlib.resources
 import json
 import re
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Literal
@@ -173,6 +173,21 @@ class Experiment(_Table):
     def fold_numbers(self) -> tuple[int | None, ...]:
         """The folds; (None,) for the dataset's own split."""
         return (None,) if self.folds is None else tuple(range(self.folds))
+
+    def on(self, environments: Sequence[str]) -> "Experiment":
+        """The experiment in these environments; in all of its own where none is named.
+
+        Raises:
+            TrainingError: it has no such environment.
+        """
+        unknown = [name for name in environments if name not in self.environments]
+        if unknown:
+            known = ", ".join(map(repr, self.environments))
+            raise TrainingError(
+                f"--environment {unknown[0]!r}: {self.name} has no such environment; they are {known}"
+            )
+        chosen = {name: choice for name, choice in self.environments.items() if name in environments}
+        return self.model_copy(update={"environments": chosen}) if environments else self
 
     def at_profile(self, profile: Profile) -> "Experiment":
         """The same experiment with another profile's datasets and training tables.

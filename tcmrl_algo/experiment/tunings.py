@@ -9,10 +9,9 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.algorithms.core.method import METHODS, Factors, Search, SettingValue
-from tcmrl_algo.algorithms.core.settings import UNREAD, ActorCriticSettings
+from tcmrl_algo.algorithms.core.settings import UNREAD, ActorCriticSettings, TrainingConfig
 from tcmrl_algo.experiment.results import Tuned, read_table
 from tcmrl_algo.experiment.spec import Experiment, override_texts
-from tcmrl_algo.training.config import TrainingConfig
 from tcmrl_data import Profile, TrainingError, apply_overrides
 from tcmrl_data.foundation.records import read_record
 

@@ -12,7 +12,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from tcmrl_algo.algorithms.core.problem import MomentsRecord
-from tcmrl_algo.training.config import TrainingConfig
+from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_data import CheckpointError, Dataset, open_dataset
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import make_folders, publish_folder, remove_abandoned, remove_tree

@@ -1,36 +1,20 @@
 """The `[training]` table of a recipe, resolved: what a run does, validated once."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Literal
-
-from pydantic import BaseModel, ConfigDict
+from typing import Any
 
 from tcmrl_algo.algorithms.core.method import METHODS, Method
 from tcmrl_algo.algorithms.core.problem import StagePlan
-from tcmrl_algo.algorithms.core.settings import PROTOCOL_GROUP, TrainingSettings
+from tcmrl_algo.algorithms.core.settings import (
+    PROTOCOL_GROUP,
+    TrainingConfig,
+    TrainingSettings,
+    TrainingSource,
+)
 from tcmrl_data import Dataset, Profile, TrainingError, apply_overrides, load_recipe
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
 from tcmrl_data.foundation.plugins import check_declared
 from tcmrl_data.foundation.records import validate_table
-
-TrainingSource = Literal["table", "recipe", "defaults"]
-"""Whence a method's own settings: the given table, the installed recipe's, or the method's defaults."""
-
-
-class TrainingConfig(BaseModel):
-    """A resolved run: the shared settings and the chosen method's own table.
-
-    Attributes:
-        settings: the shared tables.
-        method: the table named after the algorithm, as the method's `Config` dumps it.
-        training_source: where the method's own table comes from.
-    """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    settings: TrainingSettings
-    method: dict[str, Any]
-    training_source: TrainingSource = "table"
 
 
 def resolve(

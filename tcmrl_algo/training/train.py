@@ -13,9 +13,10 @@ from torch import Tensor
 
 from tcmrl_algo.algorithms.core.method import Algorithm
 from tcmrl_algo.algorithms.core.problem import MomentsRecord, TaskParameters, problem_of
+from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_algo.training.batches import StagedBatches, open_batches
 from tcmrl_algo.training.checkpoint import Run, RunRecord, open_run, tensors_digest, write_run
-from tcmrl_algo.training.config import TrainingConfig, method_of, stage_plan
+from tcmrl_algo.training.config import method_of, stage_plan
 from tcmrl_algo.training.memory import keep_freed_memory
 from tcmrl_algo.training.metrics import MetricsWriter
 from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError

@@ -1,6 +1,6 @@
 """The tables `[training.…]` that methods share: validated values, each with its source."""
 
-from typing import Literal
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, PositiveInt
 
@@ -225,3 +225,23 @@ class TrainingSettings(BaseModel):
     batch: BatchSettings = BatchSettings()
     optimizer: OptimizerSettings = OptimizerSettings()
     actor_critic: ActorCriticSettings = ActorCriticSettings()
+
+
+TrainingSource = Literal["table", "recipe", "defaults"]
+"""Whence a method's own settings: the given table, the installed recipe's, or the method's defaults."""
+
+
+class TrainingConfig(BaseModel):
+    """A resolved run: the shared settings and the chosen method's own table.
+
+    Attributes:
+        settings: the shared tables.
+        method: the table named after the algorithm, as the method's `Config` dumps it.
+        training_source: where the method's own table comes from.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    settings: TrainingSettings
+    method: dict[str, Any]
+    training_source: TrainingSource = "table"
