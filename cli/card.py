@@ -11,7 +11,7 @@ from .frame import print_json, remark
 from .places import DATASET_PATH
 
 FORMATS = ("bibtex", "cff", "text")
-KINDS = ("manifest", "part", "recipe", "events")
+KINDS = ("manifest", "part", "recipe")
 
 dataset_argument = click.argument("dataset", type=DATASET_PATH)
 quiet_option = click.option("--quiet", is_flag=True, help="Print only results and errors.")
@@ -49,7 +49,7 @@ def cite(dataset: Path, form: str) -> None:
 @click.command()
 @click.argument("kind", type=click.Choice(KINDS))
 def schema(kind: str) -> None:
-    """Print the JSON Schema (2020-12) of a dataset's manifest, part, resolved recipe or line of events.
+    """Print the JSON Schema (2020-12) of a dataset's manifest, part or resolved recipe.
 
     \b
     Example:

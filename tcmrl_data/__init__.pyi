@@ -2,13 +2,13 @@ from .behavior.base import BEHAVIOR_SOURCES as BEHAVIOR_SOURCES
 from .behavior.sb3_zip import import_sac as import_sac
 from .building.build import BuildReport as BuildReport
 from .building.build import build_dataset as build_dataset
-from .building.events import BuildEvent as BuildEvent
-from .building.events import BuildStatus as BuildStatus
-from .building.events import build_status as build_status
 from .building.forecast import Forecast as Forecast
 from .building.forecast import forecast_build as forecast_build
 from .building.plan import BuildPlan as BuildPlan
 from .building.plan import plan_build as plan_build
+from .building.work_files import BuildEvent as BuildEvent
+from .building.work_files import BuildStatus as BuildStatus
+from .building.work_files import build_status as build_status
 from .dataset.dataset import Dataset as Dataset
 from .dataset.dataset import open_dataset as open_dataset
 from .dataset.diff import DatasetDiff as DatasetDiff

@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from tcmrl_data import open_dataset, verify_dataset
-from tcmrl_data.building.events import EVENTS
+from tcmrl_data.building.work_files import STATUS
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING
 from tcmrl_data.store.tables import PartKey
 
@@ -36,7 +36,7 @@ def data_files(folder: Path) -> list[Path]:
     return sorted(
         path
         for path in folder.rglob("*")
-        if path.is_file() and not path.relative_to(folder).parts[0].startswith((".", EVENTS))
+        if path.is_file() and not path.relative_to(folder).parts[0].startswith((".", STATUS))
     )
 
 

@@ -22,10 +22,10 @@ from tcmrl_data import (
     roll_out,
 )
 from tcmrl_data.building.build import Driver
-from tcmrl_data.building.events import BuildEvent, EventLog
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.plan import plan_build
 from tcmrl_data.building.unit import UnitSpec, run_unit
+from tcmrl_data.building.work_files import BuildEvent, StatusFile
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.envs.base import LaneStep
 from tcmrl_data.envs.controller import BoolArray, FloatArray
@@ -277,8 +277,7 @@ class HastyEngine(BaseEngine):
 
 def test_a_unit_that_is_done_without_its_parts_failed(tiny_recipe: Recipe, tmp_path: Path) -> None:
     driver = Driver(Ledger(plan_build(tiny_recipe, tasks=[3]), tmp_path), tmp_path)
-    with EventLog(tmp_path, lambda event: None) as log:
-        (failure,) = driver.run(HastyEngine(), log)
+    (failure,) = driver.run(HastyEngine(), StatusFile(tmp_path))
     assert "task 3 failed" in failure
     assert "ended without 3 of its parts, the first is parts/main/00003/0000000.zip" in failure
     assert not read_manifest(tmp_path).complete

@@ -16,9 +16,9 @@ import pytest
 import tcmrl_data
 from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import CheckpointFolder, TrainingState
-from tcmrl_data.building.events import EVENTS, BuildEvent
 from tcmrl_data.building.plan import plan_build
 from tcmrl_data.building.unit import UnitSpec, run_unit
+from tcmrl_data.building.work_files import STATUS, BuildEvent
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS
@@ -183,7 +183,7 @@ def test_the_warning_of_a_unit_reaches_the_record_and_the_user(tiny_recipe: Reci
     seen: list[BuildEvent] = []
     tcmrl_data.build_dataset(tiny_recipe, tmp_path / "out", tasks=[3], engine=Engine(), progress=seen.append)
     assert [event.message for event in seen if event.kind == "warning"] == ["task 3: the disk is full"]
-    assert '"task 3: the disk is full"' in (tmp_path / "out" / EVENTS).read_text()
+    assert '"task 3: the disk is full"' in (tmp_path / "out" / STATUS).read_text()
 
 
 SAVE_OR_LOAD = """
@@ -306,5 +306,5 @@ def test_an_interrupted_build_leaves_a_checkpoint_of_its_training(
 
 def status_steps(out: Path) -> int:
     """Steps of training that the build has recorded."""
-    lines = (out / EVENTS).read_text().splitlines() if (out / EVENTS).is_file() else []
-    return max([json.loads(line)["steps_done"] for line in lines], default=0)
+    steps: int = json.loads((out / STATUS).read_text())["steps_done"] if (out / STATUS).is_file() else 0
+    return steps

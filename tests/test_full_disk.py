@@ -1,7 +1,6 @@
 """Full and read-only disks: one line names the file and the remedy, and no file is incomplete."""
 
 import json
-import os
 import resource
 import shutil
 import subprocess
@@ -11,9 +10,8 @@ from pathlib import Path
 import pytest
 
 import tcmrl_data
-from tcmrl_data import BuildEvent, Dataset
-from tcmrl_data.building.events import EventLog
-from tcmrl_data.foundation.errors import BuildError, CacheError, StorageError
+from tcmrl_data import Dataset
+from tcmrl_data.foundation.errors import BuildError, CacheError
 from tcmrl_data.foundation.machine import size
 from tcmrl_data.sampling.cache import cached_rows
 from tests.conftest import TASKS, TINY
@@ -125,14 +123,3 @@ def test_a_cache_that_cannot_be_written_names_the_variable(
     monkeypatch.setenv("TCMRL_CACHE", str(tmp_path / "file" / "cache"))
     with pytest.raises(CacheError, match=r"Not a directory.*set TCMRL_CACHE to a folder that can be written"):
         cached_rows(tiny.select(split="train"))
-
-
-@pytest.mark.check
-def test_a_record_of_events_on_a_full_disk_is_named(tmp_path: Path) -> None:
-    event = BuildEvent("start", None, 0, 1, 0, 3, 0, 450, "1 of 1 tasks to build")
-    with EventLog(tmp_path, lambda event: None) as log:
-        full = os.open("/dev/full", os.O_WRONLY)
-        os.dup2(full, log._file)
-        os.close(full)
-        with pytest.raises(StorageError, match=r"events.jsonl: No space left on device; make room"):
-            log.write(event)

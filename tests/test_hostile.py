@@ -2,6 +2,7 @@
 
 import contextlib
 import gc
+import json
 import os
 import resource
 import shutil
@@ -245,7 +246,7 @@ def test_a_repair_or_gc_of_a_hostile_dataset_leads_nowhere(
 
 LINKS = {
     **dict.fromkeys(
-        (".lock", "events.jsonl", ".staging/task.lock", ".checkpoints/task_00000/state.json"), "secret"
+        (".lock", "status.json", ".staging/task.lock", ".checkpoints/task_00000/state.json"), "secret"
     ),
     **dict.fromkeys((".staging", ".checkpoints", ".staging/repair", ".checkpoints/task_00000"), ""),
 }
@@ -269,15 +270,11 @@ def test_nothing_is_written_through_a_link(forge: Forge, name: str, command: str
 def test_status_shows_a_strangers_record_without_obeying_it(
     forge: Forge, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    numbers = '"tasks_done":0,"tasks_total":1,"parts_done":0,"parts_total":1,"steps_done":0,"steps_total":1'
-    lines = [
-        f'{{"time":1,"process":1,"kind":"start","unit":null,"message":"",{numbers}}}',
-        f'{{"time":"x","process":1,"kind":"unit_failed","unit":null,"message":"a",{numbers}}}',
-        f'{{"time":NaN,"process":1,"kind":"unit_failed","unit":null,"message":"b",{numbers}}}',
-        f'{{"time":2,"process":1,"kind":"unit_failed","unit":"t","message":"c\\u001b[2J[red]",{numbers}}}',
-    ]
-    (forge.folder / "events.jsonl").write_text("\n".join(lines) + "\n")
-    assert run(data, ["status", str(forge.folder)]) == 0
+    status = {"time": 1.0, "parts_done": 0, "parts_total": 1, "steps_done": 0, "steps_total": 1}
+    status |= {"running": [], "warnings": [], "num_failed": 1, "steps_per_second": None}
+    for failed in ("c\x1b[2J[red]",), ({},):
+        (forge.folder / "status.json").write_text(json.dumps({**status, "failed": failed}))
+        assert run(data, ["status", str(forge.folder)]) == 0
     printed = capsys.readouterr().out
     assert r"c\x1b[2J[red]" in printed
     assert printed.count("failed") == 1

@@ -19,7 +19,7 @@ from tcmrl_data import (
     repair_dataset,
     verify_dataset,
 )
-from tcmrl_data.building.events import EVENTS, BuildEvent
+from tcmrl_data.building.work_files import STATUS, BuildEvent
 from tcmrl_data.foundation.disk import LOCK, lock_file, lock_holder, make_own, replace_file
 from tcmrl_data.foundation.errors import LockedError
 from tcmrl_data.store.manifest import MANIFEST
@@ -253,4 +253,4 @@ def test_a_file_is_made_ones_own_before_it_is_written_into(tmp_path: Path) -> No
     make_own(tmp_path / "none", num_bytes=4, staging=staging)
     assert not (tmp_path / "none").is_symlink()
     assert theirs.read_bytes() == b"0123456789"
-    assert {EVENTS, MANIFEST}.isdisjoint(path.name for path in tmp_path.iterdir())
+    assert {STATUS, MANIFEST}.isdisjoint(path.name for path in tmp_path.iterdir())

@@ -12,7 +12,6 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import Dataset
-from tcmrl_data.building.events import BuildEvent, EventLog
 from tcmrl_data.describe.schema import SchemaKind, json_schema, schema_file
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part import RECORD
@@ -32,7 +31,7 @@ def validator(kind: str) -> jsonschema.Draft202012Validator:
 
 
 def documents(dataset: Dataset) -> dict[str, Any]:
-    """A document of every kind but events."""
+    """A document of every kind."""
     manifest = json.loads((dataset.folder / MANIFEST).read_text(encoding="utf-8"))
     with dataset.open_part(next(iter(dataset.parts))) as archive:
         part = json.loads(archive.read(RECORD))
@@ -102,18 +101,3 @@ def test_recipes_of_all_profiles_satisfy_the_schema() -> None:
         for profile in ("paper", "quick"):
             recipe = tcmrl_data.load_recipe(name, profile=profile)
             schema.validate(recipe.model_dump(mode="json"))
-
-
-def test_lines_of_events_satisfy_the_schema(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tcmrl_data.building.events.EVENTS_BYTES", 700)
-    event = BuildEvent("part", "task_00003", 0, 5, 1, 15, 0, 750, "published")
-    with EventLog(tmp_path, lambda event: None) as log:
-        for _ in range(4):
-            log.write(event)
-    lines = [json.loads(line) for line in (tmp_path / "events.jsonl").read_text().splitlines()]
-    schema = validator("events")
-    assert [line["kind"] for line in lines][:2] == ["rotated", "part"]
-    for line in lines:
-        schema.validate(line)
-        assert not schema.is_valid({**line, "surprise": 1})
-        assert not schema.is_valid({**line, "kind": "unheard-of"})

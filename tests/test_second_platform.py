@@ -11,7 +11,7 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import BuildEvent, load_recipe, open_dataset, verify_dataset
-from tcmrl_data.building.events import EVENTS
+from tcmrl_data.building.work_files import STATUS
 from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK
 from tcmrl_data.store.tables import PartKey, part_file
@@ -82,8 +82,7 @@ def test_a_half_built_dataset_is_completed_on_another_platform(half_built: Path)
     made_here = {step: (half_built / part_file(PartKey(0, step))).read_bytes() for step in (0, 100)}
     elsewhere("build", *RECIPE, "--tasks", "0", "--workers", "1", "--out", half_built)
 
-    events = [json.loads(line) for line in (half_built / EVENTS).read_text().splitlines()]
-    (warning,) = [event["message"] for event in events if event["kind"] == "warning"]
+    (warning,) = json.loads((half_built / STATUS).read_text())["warnings"]
     assert warning.startswith("parts were made on another platform (")
     assert "MKL_CBWR unset there, AVX2 here" in warning
     assert {step: (half_built / part_file(PartKey(0, step))).read_bytes() for step in made_here} == made_here

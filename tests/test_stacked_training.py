@@ -13,14 +13,13 @@ from stable_baselines3 import SAC
 
 import tcmrl_data
 from tcmrl_data import Recipe, load_recipe, open_dataset
-from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder
+from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder, checkpoint_name
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.behavior.stacked import StackedSource
 from tcmrl_data.behavior.stacked_training import GroupTraining
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.plan import BuildPlan, plan_build
 from tcmrl_data.building.unit import UnitSpec, run_unit
-from tcmrl_data.building.work_files import checkpoint_name
 from tcmrl_data.foundation.canonical import canonical_json
 from tcmrl_data.foundation.disk import CHECKPOINTS, make_folders
 from tcmrl_data.foundation.errors import BuildError

@@ -14,7 +14,7 @@ from tcmrl_cli import verification as verification_commands
 from tcmrl_cli.data import data
 
 from tcmrl_data import verify_dataset
-from tcmrl_data.building.events import EVENTS
+from tcmrl_data.building.work_files import STATUS
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING
 from tcmrl_data.foundation.errors import (
     ManifestError,
@@ -121,7 +121,7 @@ def test_every_swap_of_two_files_that_differ_is_found(sound: Path) -> None:
 
 
 def test_work_files_are_no_data(sound: Path) -> None:
-    for name in (LOCK, EVENTS):
+    for name in (LOCK, STATUS):
         (sound / name).write_text("anything")
     (sound / STAGING).mkdir(exist_ok=True)
     (sound / CHECKPOINTS / "task_00003").mkdir(parents=True)

@@ -11,6 +11,7 @@ The names of snapshots and tasks are repeated here.
 import abc
 import contextlib
 import math
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -163,6 +164,24 @@ __all__ = [
     "Task",
     "TrainingState",
 ]
+
+
+_CHECKPOINT_NAME = re.compile(r"tasks?_([0-9]{5,10})(?:_([0-9]{5,10}))?")
+
+
+def checkpoint_name(tasks: Sequence[Task]) -> str:
+    """Name of the folder of a unit's checkpoints: its first and its last task, in ascending order."""
+    first, last = tasks[0].index, tasks[-1].index
+    return f"task_{first:05d}" if first == last else f"tasks_{first:05d}_{last:05d}"
+
+
+def checkpoint_tasks(name: str) -> range | None:
+    """The indices from the first to the last task of a checkpoint folder; None if it is none.
+
+    The tasks between the two may be tasks of the unit or not built at all.
+    """
+    match = _CHECKPOINT_NAME.fullmatch(name)
+    return range(int(match[1]), int(match[2] or match[1]) + 1) if match else None
 
 
 @dataclass(frozen=True)

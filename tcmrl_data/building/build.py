@@ -10,12 +10,19 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.behavior.base import CHECKPOINT_SECONDS
-from tcmrl_data.building.events import BuildEvent, EventKind, EventLog
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.nodes import check_nodes
 from tcmrl_data.building.plan import plan_build
 from tcmrl_data.building.unit import UnitSpec
-from tcmrl_data.building.work_files import ASSEMBLY, WORK_FILES, WORK_FOLDERS, check_work_files
+from tcmrl_data.building.work_files import (
+    ASSEMBLY,
+    WORK_FILES,
+    WORK_FOLDERS,
+    BuildEvent,
+    EventKind,
+    StatusFile,
+    check_work_files,
+)
 from tcmrl_data.engine.base import BaseEngine, Result, Unit, make_engine
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.canonical import differences
@@ -111,9 +118,8 @@ def build_dataset(
             _check_space(out, ledger.num_missing * plan.part_bytes, ledger.num_missing)
             present = ledger.num_parts
             if ledger.num_missing:
-                with EventLog(out, progress) as log:
-                    driver = Driver(ledger, out.resolve(), checkpoint_seconds=checkpoint_seconds)
-                    failed = driver.run(runner, log)
+                driver = Driver(ledger, out.resolve(), checkpoint_seconds=checkpoint_seconds)
+                failed = driver.run(runner, StatusFile(out, progress))
             elif not ledger.is_sealed():
                 ledger.begin()
     except ReadOnlyError:
@@ -187,7 +193,7 @@ class Driver:
         self._steps_done = self._steps_total = 0
         self._deadline = 0.0
 
-    def run(self, engine: BaseEngine, log: EventLog) -> tuple[str, ...]:
+    def run(self, engine: BaseEngine, log: StatusFile) -> tuple[str, ...]:
         """Runs the units; returns one line per failure.
 
         However the units end, the manifest then names every part that was taken in.
@@ -275,7 +281,7 @@ class Driver:
         for task in tasks:
             self._ledger.take_in_unreported(task.index, deadline=deadline)
 
-    def _on_message(self, unit: str, message: Mapping[str, Any], log: EventLog) -> None:
+    def _on_message(self, unit: str, message: Mapping[str, Any], log: StatusFile) -> None:
         if message["kind"] == "steps":
             self._steps_done += message["count"]
             log.write(self._event("steps", unit, unit))

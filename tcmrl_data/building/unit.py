@@ -6,10 +6,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, final
 
-from tcmrl_data.behavior.base import CHECKPOINT_SECONDS, BehaviorContext, BehaviorSource, CheckpointFolder
+from tcmrl_data.behavior.base import (
+    CHECKPOINT_SECONDS,
+    BehaviorContext,
+    BehaviorSource,
+    CheckpointFolder,
+    checkpoint_name,
+)
 from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.building.work_files import checkpoint_name
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.canonical import digest

@@ -4,59 +4,23 @@ A schema knows names, types and bounds. What it cannot say, such as that a diges
 when a file is read.
 """
 
-import typing
 from typing import Any, Literal
 
-from pydantic import Field, TypeAdapter, create_model
+from pydantic import TypeAdapter
 
-from tcmrl_data.building.events import BuildEvent
-from tcmrl_data.foundation.records import Record
 from tcmrl_data.recipe.document import RECIPE_SCHEMA
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.manifest import MANIFEST_SCHEMA, Manifest
 from tcmrl_data.store.part import PART_SCHEMA, PartRecord
 
-SchemaKind = Literal["manifest", "part", "recipe", "events"]
+SchemaKind = Literal["manifest", "part", "recipe"]
 
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
-
-EVENTS_SCHEMA = 1
-"""Raised when the lines of `events.jsonl` change."""
-
-
-class EventSummary(Record):
-    """What the events before a rotation of the file add up to.
-
-    Attributes:
-        running: units at work.
-        failed: messages of the latest failed units.
-        paces: Unix times with the environment steps that were done then.
-    """
-
-    running: list[str]
-    failed: list[str]
-    num_failed: int
-    paces: list[tuple[float, int]]
-
-
-_FIELDS: dict[str, Any] = {
-    "time": (float, Field(description="Unix time in seconds.")),
-    "process": (int, Field(description="Number of the process that builds.")),
-} | {name: (kind, ...) for name, kind in typing.get_type_hints(BuildEvent).items()}
-
-EventLine = create_model("EventLine", __base__=Record, __doc__=BuildEvent.__doc__, **_FIELDS)
-RotatedLine = create_model(
-    "RotatedLine",
-    __base__=Record,
-    __doc__="The first line after a rotation of the file; it sums up the lines before.",
-    **(_FIELDS | {"kind": (Literal["rotated"], ...), "summary": (EventSummary, ...)}),
-)
 
 _MODELS: dict[SchemaKind, tuple[TypeAdapter[Any], int, str]] = {
     "manifest": (TypeAdapter(Manifest), MANIFEST_SCHEMA, "manifest.json of a dataset"),
     "part": (TypeAdapter(PartRecord), PART_SCHEMA, "part.json in the archive of a part"),
     "recipe": (TypeAdapter(Recipe), RECIPE_SCHEMA, "A resolved recipe, as a manifest records it"),
-    "events": (TypeAdapter(EventLine | RotatedLine), EVENTS_SCHEMA, "A line of events.jsonl"),
 }
 
 

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+from tcmrl_data.behavior.base import checkpoint_tasks
 from tcmrl_data.building.work_files import (
     ASSEMBLY,
     CROISSANT_FILES,
@@ -13,7 +14,6 @@ from tcmrl_data.building.work_files import (
     WORK_FILES,
     WORK_FOLDERS,
     check_work_files,
-    checkpoint_tasks,
 )
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import (

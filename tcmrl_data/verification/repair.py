@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from tcmrl_data.building.build import build_dataset
-from tcmrl_data.building.events import BuildEvent
-from tcmrl_data.building.work_files import check_work_files
+from tcmrl_data.building.work_files import BuildEvent, check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.disk import (
     LOCK,
