@@ -16,10 +16,10 @@ from tcmrl_data.building import ledger
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import BuildError, ManifestError, TaskError
 from tcmrl_data.foundation.records import sealed
-from tcmrl_data.store import keys, manifest, tables
+from tcmrl_data.store import manifest, tables
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
-from tcmrl_data.store.tables import PartKey, parse_tasks, part_file, task_line
+from tcmrl_data.store.tables import PartKey, check_plan, parse_tasks, part_file, task_line
 from tests.conftest import TINY
 from tests.simulated_disk import PreparedParts, at_last_part
 
@@ -249,7 +249,7 @@ def test_tasks_that_cannot_be_dropped_are_refused(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("limit", ["MAX_TASKS", "MAX_PARTS", "MAX_STEPS", "MAX_COLUMNS", "LINE_BYTES"])
+@pytest.mark.parametrize("limit", ["MAX_TASKS", "MAX_PARTS", "MAX_STEPS", "MAX_COLUMNS"])
 def test_a_dataset_at_a_limit_is_built_and_read_and_one_beyond_is_refused_before_work(
     parts: PreparedParts, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, limit: str
 ) -> None:
@@ -259,11 +259,10 @@ def test_a_dataset_at_a_limit_is_built_and_read_and_one_beyond_is_refused_before
         "MAX_PARTS": 3,
         "MAX_STEPS": 3,
         "MAX_COLUMNS": max(environment.observation_dim, environment.action_dim),
-        "LINE_BYTES": len(task_line(tiny.task(TASK))),
     }[limit]
 
     def allow(number: int) -> None:
-        for module in (keys, manifest):
+        for module in (tables, manifest):
             monkeypatch.setattr(module, limit, number, raising=False)
 
     allow(largest - 1)
@@ -296,9 +295,12 @@ def test_the_limits_of_tasks_and_of_parts_are_those_that_are_stated(tmp_path: Pa
 
 
 def test_the_longest_line_of_a_task_that_a_writer_may_write_is_read() -> None:
-    length = keys.LINE_BYTES - len(task_line(Task(7, "train", {"text": ""})))
+    length = tables.LINE_BYTES - len(task_line(Task(7, "train", {"text": ""})))
+    check_plan(tasks=1, steps=1, columns=1, largest_task=tables.LINE_BYTES)
+    with pytest.raises(BuildError, match="65,537 bytes for the parameters of one task, more than the 65,536"):
+        check_plan(tasks=1, steps=1, columns=1, largest_task=tables.LINE_BYTES + 1)
     task = Task(7, "train", {"text": "x" * length})
-    assert len(task_line(task)) == keys.LINE_BYTES
+    assert len(task_line(task)) == tables.LINE_BYTES
     assert parse_tasks(task_line(task), Path("tasks.jsonl")) == (task,)
 
 

@@ -23,7 +23,7 @@ from tcmrl_data.foundation.errors import (
     NondeterminismError,
 )
 from tcmrl_data.foundation.records import sealed
-from tcmrl_data.parts import rollouts
+from tcmrl_data.parts import own_operations
 from tcmrl_data.store import manifest as manifest_module
 from tcmrl_data.store import part
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
@@ -229,8 +229,8 @@ def test_parts_that_come_out_otherwise_are_taken_and_the_manifest_says_so(
 ) -> None:
     folder, key = tiny_copy(), PartKey(3, 0)
     (folder / part_file(key)).unlink()
-    drawn = rollouts.keyed_generator
-    monkeypatch.setattr(rollouts, "keyed_generator", lambda *words: drawn(*words[:-1], words[-1] + 100))
+    drawn = own_operations.keyed_generator
+    monkeypatch.setattr(own_operations, "keyed_generator", lambda *words: drawn(*words[:-1], words[-1] + 100))
     report = repair_dataset(folder, accept=True)
     assert (report.accepted, report.repaired, report.left) == ((key,), (), ())
     assert report.root == read_manifest(folder).root != read_manifest(tiny_folder).root

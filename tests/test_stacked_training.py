@@ -331,9 +331,9 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
     program = (
         "import json, re, sys\n"
         "from pathlib import Path\n"
-        "from tcmrl_data.behavior import checkpoints\n"
+        "from tcmrl_data.behavior.base import CheckpointFolder\n"
         "from tcmrl_data.building.unit import UnitSpec, run_unit\n"
-        "checkpoints.CheckpointFolder.is_due = lambda self: True\n"
+        "CheckpointFolder.is_due = lambda self: True\n"
         "run_unit(UnitSpec.from_json(json.load(sys.stdin)), lambda message: None)\n"
         "print(1024 * int(re.search(r'VmHWM:\\s+(\\d+) kB', Path('/proc/self/status').read_text())[1]))\n"
     )
