@@ -47,7 +47,13 @@ from tcmrl_algo.algorithms.core.method import (
     Options,
     Search,
 )
-from tcmrl_algo.algorithms.core.networks import Attention, Perceptron, call_frozen, mean_representation
+from tcmrl_algo.algorithms.core.networks import (
+    Attention,
+    Perceptron,
+    call_frozen,
+    mean_representation,
+    weighted_sum,
+)
 from tcmrl_algo.algorithms.core.problem import Problem
 from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Windows
@@ -160,7 +166,7 @@ class TaskExtractor(nn.Module):
         inputs = torch.cat([representations, mean.expand_as(representations)], dim=-1)
         scores = self.perceptron(inputs).squeeze(-1)
         weights = torch.softmax(where_real(mask, scores, -torch.inf), dim=-1)
-        context = torch.einsum("lt,ltd->ld", weights, where_real(mask.unsqueeze(-1), representations, 0.0))
+        context = weighted_sum(weights, where_real(mask.unsqueeze(-1), representations, 0.0))
         return Attention(representations, scores, weights, context, mask)
 
 
@@ -244,7 +250,7 @@ def reverse_context(
     reverse = where_real(mask, 1.0 - weights, 0.0)
     if not literal:
         reverse = reverse / (mask.sum(dim=-1, keepdim=True) - 1).clamp(min=1)
-    return torch.einsum("lt,ltd->ld", reverse, representations)
+    return weighted_sum(reverse, representations)
 
 
 def negative_reward_loss(
@@ -290,8 +296,9 @@ def task_contrastive_loss(
     if representations.shape[2] < window_length:
         return (representations * 0.0).sum() + (similarity * 0.0).sum()
     last = window_length - 1
-    flat = representations[:, :, :-1].flatten(0, 1).transpose(1, 2)  # every step but the last begins a prior
-    priors = functional.avg_pool1d(flat, last, stride=1).transpose(1, 2)
+    priors = representations[:, :, :-1].flatten(0, 1)  # every step but the last begins a prior
+    if last > 1:
+        priors = functional.avg_pool1d(priors.transpose(1, 2), last, stride=1).transpose(1, 2)
     return info_nce(
         (priors @ similarity).unflatten(0, representations.shape[:2]).permute(1, 2, 0, 3),
         representations[:, :, last:].permute(1, 2, 0, 3),

@@ -289,7 +289,7 @@ def _check_sizes(metrics: Mapping[str, Tensor], limits: Mapping[str, float], ste
         DivergenceError: with the first such metric, its value, its limit and the step.
     """
     largest = [limits.get(name, sys.float_info.max) for name in metrics]
-    sizes = torch.stack([value.double().abs() for value in metrics.values()]).tolist()
+    sizes = torch.stack([*metrics.values()]).double().abs().tolist()
     for name, size, limit in zip(metrics, sizes, largest, strict=True):
         if math.isnan(size) or size > limit:
             what = f"is {size:.3g}, beyond {limit:.3g}," if name in limits else "is not finite"

@@ -27,7 +27,8 @@ def where_real(mask: Bool[Tensor, "*rows"], values: Tensor, padding: float) -> T
 
 def masked_mean(values: Float[Tensor, "*shape"], mask: Bool[Tensor, "*shape"]) -> Scalar:
     """Mean of the values where the mask is True; 0 where it is nowhere True."""
-    return where_real(mask, values, 0.0).sum() / mask.sum().clamp(min=1)
+    real = where_real(mask, values, 0.0)
+    return real.sum() / (mask.numel() if real is values else mask.sum().clamp(min=1))
 
 
 def info_nce(
@@ -50,10 +51,14 @@ def info_nce(
     """
     # contiguous, mask included: otherwise products fall back to one small product per position
     queries, keys, mask = queries.contiguous(), keys.contiguous(), mask.contiguous()
-    logits = queries @ keys.mT / temperature
-    logits = where_real(mask.unsqueeze(-2), logits, -torch.inf)
+    logits = queries @ keys.mT
+    if temperature != 1.0:
+        logits = logits / temperature
     present = mask & (mask.sum(dim=-1, keepdim=True) > 1)  # a lone task has nothing to be told apart from
-    logits = where_real(present.unsqueeze(-1), logits, 0.0)  # keeps rows without any key free of NaN
+    known = mask.unsqueeze(-2) & present.unsqueeze(-1)
+    if known.device.type != "cpu" or not bool(known.all()):
+        nowhere = torch.where(present, -torch.inf, 0.0)  # 0 keeps rows without any key free of NaN
+        logits = torch.where(known, logits, nowhere.unsqueeze(-1))
     matching = torch.diagonal(torch.log_softmax(logits, dim=-1), dim1=-2, dim2=-1).contiguous()
     return -masked_mean(matching, present)
 

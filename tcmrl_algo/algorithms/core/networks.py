@@ -76,14 +76,15 @@ class Perceptron(nn.Module):
         )
 
     def forward(self, inputs: Float[Tensor, "*rows inputs"]) -> Float[Tensor, "*rows outputs"]:
-        rows = inputs.reshape(-1, inputs.shape[-1])  # an activation in place on a view would copy gradients
+        # An activation in place on a view would copy gradients.
+        rows = inputs if inputs.ndim == 2 else inputs.reshape(-1, inputs.shape[-1])
         *hidden, last = self.layers
         reduced = self.hidden_dtype is not torch.float32
         with torch.autocast(rows.device.type, self.hidden_dtype) if reduced else nullcontext():
             for layer in hidden:
                 rows = self._activation(layer(rows))
         outputs: Tensor = last(rows.to(inputs.dtype))
-        return outputs.view(*inputs.shape[:-1], outputs.shape[-1])
+        return outputs if inputs.ndim == 2 else outputs.view(*inputs.shape[:-1], outputs.shape[-1])
 
 
 def set_hidden_dtype(module: nn.Module, dtype: torch.dtype) -> None:
@@ -131,7 +132,7 @@ class Standardizer(nn.Module):
         self.register_buffer("scale", torch.where(std < SMALLEST_SCALE, torch.ones_like(std), std))
 
     def forward(self, values: Float[Tensor, "*rows dim"]) -> Float[Tensor, "*rows dim"]:
-        return ((values - self.mean) / self.scale).clamp(-LARGEST_INPUT, LARGEST_INPUT)
+        return (values - self.mean).div_(self.scale).clamp_(-LARGEST_INPUT, LARGEST_INPUT)
 
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -193,7 +194,15 @@ def mean_representation(
 ) -> Float[Tensor, "lanes latent"]:
     """Eq. 2: c_mean = mean(c_1, ..., c_T) over each lane's real steps; FOCAL's context."""
     real = mask.unsqueeze(-1)
-    return where_real(real, representations, 0.0).sum(dim=1) / real.sum(dim=1)
+    kept = where_real(real, representations, 0.0)
+    return kept.sum(dim=1) / (mask.shape[1] if kept is representations else real.sum(dim=1))
+
+
+def weighted_sum(
+    weights: Float[Tensor, "lanes steps"], representations: Float[Tensor, "lanes steps latent"]
+) -> Float[Tensor, "lanes latent"]:
+    """sum_t w_t c_t (Eq. 5); weights are 0 on padding."""
+    return torch.bmm(weights.unsqueeze(1), representations).squeeze(1)
 
 
 @dataclass(frozen=True)
