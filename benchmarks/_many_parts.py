@@ -117,7 +117,7 @@ def measure_commands(folder: Path) -> Measured:
     program = str(Path(sys.executable).with_name("tcmrl-data"))
     commands = {
         "start": ["--help"],
-        "status": ["status", str(folder), "--json"],
+        "show": ["show", str(folder), "--json"],
         "list": ["list", str(folder.parent), "--json"],
     }
 

@@ -39,8 +39,8 @@ BUILDS = {
 """Dataset to its recipe and tasks."""
 
 CHANGES = {
-    "extended": ["extend", "stacked", "--episodes", "3", "--noise", "0.1", "--cross", "1", "--run", "more"],
-    "relabelled": ["relabel", "stacked", "--to", "nearest:2", "--run", "other"],
+    "extended": ["extend", "stacked", "--episodes", "3", "--noise", "0.1", "--cross", "1"],
+    "relabelled": ["relabel", "stacked", "--to", "nearest:2"],
     "cut": ["derive", "stacked", "--episodes", "4", "--seed", "1", "--tasks", "0,3", "--snapshots", "last"],
     "merged": ["merge", "stacked", "sac"],
 }
@@ -145,8 +145,8 @@ def make(checkout: Checkout, inputs: Path) -> dict[str, Any]:
     def learn(label: str) -> None:
         method, changes = METHODS[label]
         run = "runs/" + "".join(letter if letter.isalnum() else "-" for letter in label)
-        own = [text for value in changes for text in ("--set", value)]
-        common = ["--algo", method, "--profile", "paper", "--seed", SEED, "--steps", 50, "--out", run]
+        own = [text for value in ("run.steps=50", *changes) for text in ("--set", value)]
+        common = ["--algo", method, "--profile", "paper", "--seed", SEED, "--out", run]
         checkout.run("tcmrl", "train", "stacked", *common, *own, "--quiet")
         made[f"tensors of {label}"] = dict(tensors(checkout.work / run))
         printed = checkout.run("tcmrl", "evaluate", run, "--protocol", "all", "--json", "--quiet")

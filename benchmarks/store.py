@@ -218,7 +218,7 @@ def targets(document: Measured) -> list[Measured]:
             for row in document["open"]
             if row["parts"] >= document["resume"]["parts"] / 2
         ),
-        *((f"{name}, s", document["commands"][f"{name}_s"], 1) for name in ("status", "list")),
+        *((f"{name}, s", document["commands"][f"{name}_s"], 1) for name in ("show", "list")),
         ("driver, time a part beside many / few", many["take_in_ms"] / few["take_in_ms"], 1.5),
         ("resume, s", document["resume"]["s"], 60),
         *(

@@ -1,31 +1,36 @@
-"""`tcmrl-data`: plan, build, import, list, inspect, verify, repair and export datasets."""
+"""`tcmrl-data`: make, look at, change, keep and share datasets."""
 
 import dataclasses
+import time
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from .building import build, plan
-from .cache import cache
-from .card import card, cite, croissant, schema
-from .completion import completion
-from .curation import delete, derive, merge, rename, split
-from .dataset_report import dataset_report
-from .diff import diff
-from .exporting import export
-from .frame import main_program, make_table, output_options, print_json, print_table, remark
-from .importing import import_data
-from .inspection import inspect
-from .quality import coverage, quality, rewards
-from .recipes import recipe
-from .remaking import extend, relabel
-from .rendering import render
-from .show import show
-from .status import status
-from .verification import gc, import_policy, repair, verify
-from .worth import transfer, worth
+from tcmrl_data.foundation.machine import size
+from tcmrl_data.foundation.plain_files import printable
 
-CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
+from .changing import derive, extend, merge, relabel
+from .frame import (
+    duration,
+    main_program,
+    make_table,
+    next_commands,
+    output_options,
+    print_json,
+    print_table,
+    remark,
+)
+from .groups import SETTINGS, Commands
+from .inspection import inspect
+from .keeping import cache, delete, verify
+from .looking import dataset_report, diff, render
+from .making import build, import_data, import_policy
+from .options import DATASET, PATH
+from .sharing import card, export
+
+if TYPE_CHECKING:
+    from tcmrl_data import BuildStatus
 
 
 def main() -> None:
@@ -33,14 +38,14 @@ def main() -> None:
     main_program(data)
 
 
-@click.group(name="tcmrl-data", context_settings=CONTEXT)
+@click.group(name="tcmrl-data", cls=Commands, context_settings=SETTINGS)
 @click.version_option(package_name="tcmrl")
 def data() -> None:
-    """Build, inspect, verify and export datasets for offline meta-reinforcement learning.
+    """Make, look at, change and share datasets for offline meta-reinforcement learning.
 
     \b
     Examples:
-      tcmrl-data plan point-robot --profile quick
+      tcmrl-data build point-robot --profile quick --plan
       tcmrl-data build point-robot --profile quick
       tcmrl-data inspect returns data/point-robot --plot returns.png
 
@@ -48,46 +53,9 @@ def data() -> None:
     """
 
 
-for _command in (
-    recipe,
-    plan,
-    build,
-    status,
-    show,
-    inspect,
-    dataset_report,
-    verify,
-    repair,
-    gc,
-    import_data,
-    import_policy,
-    cache,
-    derive,
-    merge,
-    split,
-    rename,
-    delete,
-    diff,
-    export,
-    extend,
-    relabel,
-    render,
-    completion,
-    card,
-    cite,
-    croissant,
-    schema,
-):
-    data.add_command(_command)
-
-
-for _measure in (quality, coverage, transfer, rewards, worth):
-    inspect.add_command(_measure)
-
-
-@data.command()
+@click.command()
 @output_options
-def envs(as_json: bool, quiet: bool) -> None:
+def envs(as_json: bool) -> None:
     """List the environments that have a recipe, and the ones that cannot be loaded.
 
     \b
@@ -117,11 +85,11 @@ def envs(as_json: bool, quiet: bool) -> None:
         click.echo(f"broken: {error}")
 
 
-@data.command(name="list")
-@click.argument("root", type=click.Path(path_type=Path), required=False)
+@click.command(name="list")
+@click.argument("folder", type=PATH, required=False)
 @output_options
-def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
-    """List the datasets in the folder ROOT (default: data) and its subfolders.
+def list_(folder: Path | None, as_json: bool) -> None:
+    """List the datasets and views in FOLDER (default: data) and its subfolders.
 
     \b
     Example:
@@ -129,28 +97,120 @@ def list_(root: Path | None, as_json: bool, quiet: bool) -> None:
     """
     import tcmrl_data
 
-    if root is not None and not root.is_dir():
-        raise click.ClickException(f"{root} is not a folder; name a folder that contains datasets")
-    root = root or Path("data")
-    rows = tcmrl_data.list_datasets(root)
+    if folder is not None and not folder.is_dir():
+        raise click.ClickException(f"{folder} is not a folder; name a folder that contains datasets")
+    folder = folder or Path("data")
+    rows = tcmrl_data.list_datasets(folder)
     if as_json:
         print_json({"datasets": rows})
         return
     if not rows:
-        remark(f"no datasets in {root}; build one with `tcmrl-data build ENV`", quiet=quiet)
+        remark(f"no datasets in {folder}; build one with `tcmrl-data build ENV`")
         return
     table = make_table(
-        f"Datasets in {root}",
-        columns=["dataset", "built from", "tasks", "parts", "state", "root"],
+        f"Datasets in {folder}",
+        columns=["dataset", "contents", "tasks", "parts", "root"],
         text=["root"],
-        long_text=["dataset", "built from", "state"],
+        long_text=["dataset", "contents"],
     )
     for row in rows:
         if "error" in row:
-            table.add_row(row["path"], "", "", "", f"unreadable: {row['error']}", "")
+            table.add_row(row["path"], f"unreadable: {row['error']}", "", "", "")
             continue
-        built_from = f"{row['name']}, {row['profile']}, {row['behavior']}, seed {row['seed']}"
-        state = "complete" if row["complete"] else "incomplete"
-        counts = (f"{row['tasks']:,}", f"{row['parts']:,}")
-        table.add_row(row["path"], built_from, *counts, state, row["root"][:12])
+        table.add_row(
+            row["path"], printable(_contents(row)), f"{row['tasks']:,}", f"{row['parts']:,}", row["root"][:12]
+        )
     print_table(table)
+
+
+def _contents(row: dict[str, Any]) -> str:
+    """What a dataset is called, what it was made by, and its state."""
+    made = [row["label"], row["name"], row["profile"], row["behavior"], f"seed {row['seed']}"]
+    view = f"view of {row['source']}" if row["source"] else None
+    state = "complete" if row["complete"] else "incomplete"
+    return ", ".join(filter(None, [*made, row["derived"], view, state]))
+
+
+@click.command()
+@DATASET
+@output_options
+def show(dataset: Path, as_json: bool) -> None:
+    """Print a summary of DATASET, and the progress of its build, during the build or after it.
+
+    The summary contains recipe, tasks, sizes and root of the dataset, and software and CPU of its build.
+
+    \b
+    Examples:
+      tcmrl-data show data/point-robot --json
+      watch tcmrl-data show data/half-cheetah-vel
+    """
+    import tcmrl_data
+    from tcmrl_data.dataset.listing import dataset_summary
+
+    opened = tcmrl_data.open_dataset(dataset)
+    document = dataset_summary(opened)
+    status = tcmrl_data.build_status(opened.folder) if opened.path == opened.folder else None
+    if as_json:
+        print_json(document | {"build": None if status is None else dataclasses.asdict(status)})
+        return
+    title = printable(str(opened.path))
+    table = make_table(title, columns=["property", "value"], text=["property"], long_text=["value"])
+    rows = _summary(document)
+    if status is not None and (status.builder or not document["complete"] or status.num_failed):
+        rows |= _progress(status)
+    for name, value in rows.items():
+        table.add_row(name, printable(value))
+    print_table(table)
+    if document["complete"]:
+        next_commands(
+            ["tcmrl-data", "inspect", "returns", opened.path],
+            ["tcmrl-data", "verify", opened.path],
+            ["tcmrl", "train", opened.path],
+        )
+
+
+def _summary(document: dict[str, Any]) -> dict[str, str]:
+    made, steps = document["made_with"], document["snapshots"]
+    rows = {
+        "environment": f"{document['name']}: {document['description']}",
+        "recipe": f"profile {document['profile']}, behavior {document['behavior']}, seed {document['seed']}",
+        "tasks": f"{document['tasks']:,} ({document['train']:,} train, {document['test']:,} test)",
+        "snapshots": f"{len(steps):,} per task, at steps {', '.join(f'{step:,}' for step in steps)}",
+        "parts": f"{document['parts']:,} of {document['parts_total']:,}: "
+        f"{'complete' if document['complete'] else 'incomplete'}",
+        "episodes": f"{document['episodes']:,} with {document['steps']:,} steps",
+        "size": size(document["bytes"]),
+        "root": document["root"],
+    }
+    labels = {"cpu": "CPU", "system": "system", "packages": "packages"}
+    return rows | {label: "; ".join(made[key]) for key, label in labels.items() if made[key]}
+
+
+def _progress(status: "BuildStatus") -> dict[str, str]:
+    """Rows on a build that runs, was stopped, or had failures."""
+    rate, left, updated = status.steps_per_second, status.seconds_left, status.updated
+    again = "stopped; run the same `tcmrl-data build` again to continue"
+    ended = "complete" if status.complete else again
+    rows = {
+        "build": f"running: {status.builder}" if status.builder else ended,
+        "published parts": f"{status.parts_done:,} of {status.parts_total:,}",
+        "running": ", ".join(status.running) or "nothing",
+        "rate": "unknown" if rate is None else f"{rate:,.0f} training steps/s",
+        "time left": "unknown" if left is None else f"about {duration(left)}",
+        "last update": "none" if updated is None else f"{duration(max(0.0, time.time() - updated))} ago",
+    }
+    if status.num_failed:
+        latest = f"{status.num_failed:,} units, the latest {len(status.failed):,}: "
+        rows["failed"] = latest + "; ".join(status.failed)
+    return rows
+
+
+data.fill(
+    {
+        "Make": [build, import_data, import_policy],
+        "Look": [envs, list_, show, inspect, diff, dataset_report, render],
+        "Change": [derive, merge, extend, relabel],
+        "Keep": [verify, delete, cache],
+        "Share": [export, card],
+    }
+)

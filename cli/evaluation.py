@@ -1,4 +1,4 @@
-"""`tcmrl evaluate`: adapt the policy of a run to the test tasks and print its returns."""
+"""`tcmrl evaluate` and `controls`: returns after adaptation, and what they are compared with."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 
 import click
 
-from .frame import make_table, number, output_options, print_json, print_table, remark
+from .frame import footnotes, make_table, number, output_options, print_json, print_table
+from .options import ALL_PROTOCOLS, COUNT, DATASET, FILE, INDEX, PATH, PROTOCOL_OR_ALL
 from .places import RUN_PATH
-from .plugins import ALL_PROTOCOLS, PROTOCOL
 from .progress import StageProgress
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from tcmrl_algo import Evaluation, TaskResult
+    from tcmrl_algo import Controls, Evaluation, TaskResult
 
 OTHER = "other: the same policy with the contexts of other tasks"
 PRIVILEGED = "privileged: a control that observes the task parameters"
@@ -90,37 +90,31 @@ def _mean(values: Sequence[float | None]) -> float | None:
 @click.argument("run_folder", metavar="RUN", type=RUN_PATH)
 @click.option(
     "--protocol",
-    type=PROTOCOL,
+    type=PROTOCOL_OR_ALL,
     show_default="the run's",
     help="Adaptation protocol; `all` evaluates every protocol and compares them.",
 )
 @click.option(
-    "--dataset",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    help="Folder of the run's dataset, if the dataset was moved.",
+    "--dataset", type=PATH, metavar="FOLDER", help="Folder of the run's dataset, if the dataset was moved."
 )
 @click.option(
-    "--episodes",
-    type=click.IntRange(min=1),
-    show_default="the run's",
-    help="Number of adaptation episodes per task.",
+    "--episodes", type=COUNT, show_default="the run's", help="Number of adaptation episodes per task."
 )
 @click.option(
     "--random-episodes",
-    type=click.IntRange(min=0),
+    type=INDEX,
     show_default="the run's",
     help="How many of them form the first stage of `paper` and `idaq_literal`.",
 )
 @click.option(
     "--repeats",
-    type=click.IntRange(min=1),
+    type=COUNT,
     show_default="the run's",
     help="How many times a protocol with a random first stage is run.",
 )
 @click.option(
     "--plot",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FILE,
     metavar="FILE",
     help="Also draw the paths of the adapted policy to a .png, .svg or .pdf file (point robots).",
 )
@@ -134,7 +128,6 @@ def evaluate(
     repeats: int | None,
     plot: Path | None,
     as_json: bool,
-    quiet: bool,
 ) -> None:
     """Adapt the policy of RUN to the test tasks, and evaluate it.
 
@@ -151,14 +144,14 @@ def evaluate(
     Examples:
       tcmrl evaluate runs/point-robot-tcmrl-seed0
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all --json
-      tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol offline --plot paths.png
-      tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol paper --random-episodes 2 --repeats 10
+      tcmrl evaluate runs/point-robot-tcmrl-seed0 --plot paths.png
+      tcmrl evaluate runs/point-robot-tcmrl-seed0 --repeats 10
     """
     from tcmrl_algo import evaluate_run
 
     if plot is not None and protocol == ALL_PROTOCOLS:
         raise click.UsageError("--plot draws one protocol; name it by --protocol")
-    with StageProgress(quiet=quiet) as progress:
+    with StageProgress() as progress:
         results = []
         for name in _protocols(progress) if protocol == ALL_PROTOCOLS else [protocol]:
 
@@ -191,7 +184,7 @@ def evaluate(
         SCORES[_score(results)],
         *([PRIVILEGED] if results[0].privileged else []),
     ]
-    remark("; ".join(notes), quiet=quiet)
+    footnotes(*notes)
 
 
 def _protocols(progress: StageProgress) -> list[str]:
@@ -201,3 +194,61 @@ def _protocols(progress: StageProgress) -> list[str]:
     for error in PROTOCOLS.broken().values():
         progress.note(f"left out: {error}")
     return list(PROTOCOLS.working())
+
+
+COLUMNS = ("uniform", "fixed_snapshot", "fixed_target", "behavior", "oracle")
+
+
+@click.command()
+@DATASET
+@output_options
+def controls(dataset: Path, as_json: bool) -> None:
+    """Measure the controls of DATASET: policies that do not learn across tasks.
+
+    They are measured once for a dataset and kept in the cache. Uniform actions. The best policy that acts the
+    same in all tasks: the last behavior policy of a training task (fixed snapshot) or, where there is an
+    oracle, the oracle for one target (fixed target), both fitted on the training tasks. The behavior policies
+    of the test tasks themselves, without their noise. The oracle.
+
+    \b
+    Examples:
+      tcmrl controls data/point-robot
+      tcmrl controls data/half-cheetah-vel --json
+    """
+    from tcmrl_algo import dataset_controls
+    from tcmrl_data import open_dataset
+
+    with StageProgress() as progress:
+        found = dataset_controls(
+            open_dataset(dataset),
+            report=lambda stage, done, total: progress.update(stage, done=done, total=total, unit="episodes"),
+        )
+    if as_json:
+        print_json(found.model_dump(mode="json"))
+        return
+    table = make_table(
+        f"{found.environment}: controls by test task",
+        columns=("task", *(name.replace("_", " ") for name in COLUMNS)),
+        long_text=("task",),
+    )
+    for task in found.tasks:
+        table.add_row(str(task.task), *(number(getattr(task, name)) for name in COLUMNS))
+    table.add_section()
+    table.add_row("mean", *(number(found.mean(name)) for name in COLUMNS))
+    print_table(table)
+    footnotes(*_fitted(found), FIXED, BEHAVIOR)
+
+
+def _fitted(found: "Controls") -> list[str]:
+    """What the fixed policies are, and their means over the training tasks."""
+    notes = []
+    if found.fixed_snapshot is not None:
+        policy = found.fixed_snapshot
+        mean, average = number(policy.train_return), number(policy.average_return)
+        notes.append(
+            f"fixed snapshot: task {policy.task}, step {policy.step:,} ({mean} in training tasks; "
+            f"{average} on average over the tasks' last policies)"
+        )
+    if found.fixed_target is not None:
+        notes.append(f"fixed target: {number(found.fixed_target.train_return)} in training tasks")
+    return notes

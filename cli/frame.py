@@ -5,8 +5,10 @@ import io
 import json
 import os
 import shlex
+import shutil
 import signal
 import sys
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from types import FrameType
@@ -18,6 +20,8 @@ from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.process import ENDING, leave_out_compiler, open_closed_streams, sleep_soon
 
+from .groups import GONE, gone
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -28,6 +32,9 @@ DONE, INCOMPLETE, BAD_INPUT = 0, 1, 2
 
 SPANS = ((86_400, "d", 3_600, "h"), (3_600, "h", 60, "min"), (60, "min", 1, "s"))
 """Units of time, longest first: seconds and name of the unit and of the smaller unit printed after it."""
+
+QUIET = "tcmrl.quiet"
+"""Where the context of a command keeps that it is to be quiet."""
 
 INTERRUPTED = "interrupted; run the same command again"
 
@@ -90,7 +97,9 @@ def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
         error.show()
         return BAD_INPUT
     except click.UsageError as error:
-        path = error.ctx.command_path if error.ctx else command.name
+        path = str(error.ctx.command_path if error.ctx else command.name)
+        if isinstance(error, click.NoSuchOption) and f"{path} {error.option_name}" in GONE:
+            return _fail(gone(f"{path} {error.option_name}"), BAD_INPUT)
         return _fail(f"{error.format_message()} See `{path} --help`.", BAD_INPUT)
     except click.ClickException as error:
         return _fail(error.format_message(), BAD_INPUT)
@@ -140,13 +149,26 @@ def stopped_by_signals(how_to_continue: Callable[[], str]) -> Iterator[None]:
         fail_incomplete(f"interrupted; {how_to_continue()}")
 
 
+def _be_quiet(context: click.Context, parameter: click.Parameter, value: bool) -> None:
+    context.meta[QUIET] = value
+
+
+QUIET_OPTION = click.option(
+    "--quiet", is_flag=True, expose_value=False, callback=_be_quiet, help="Print only results and errors."
+)
+
+
+def is_quiet() -> bool:
+    """Whether the running command was given `--quiet`."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(QUIET))
+
+
 def output_options(command: Command) -> Command:
     """Adds `--json` and `--quiet`."""
-    as_json = click.option(
+    return click.option(
         "--json", "as_json", is_flag=True, help="Print one JSON document on standard output."
-    )
-    quiet = click.option("--quiet", is_flag=True, help="Print only results and errors.")
-    return as_json(quiet(command))
+    )(QUIET_OPTION(command))
 
 
 def print_json(document: Any) -> None:
@@ -195,12 +217,7 @@ def make_table(
     from rich import box
     from rich.table import Table
 
-    table = Table(
-        title=title,
-        box=box.SIMPLE_HEAD,
-        collapse_padding=True,
-        pad_edge=False,
-    )
+    table = Table(title=title, box=box.SIMPLE_HEAD, collapse_padding=True, pad_edge=False)
     texts, long_texts = set(text), set(long_text)
     for column in columns:
         if column in long_texts:
@@ -210,10 +227,23 @@ def make_table(
     return table
 
 
-def remark(message: str, *, quiet: bool) -> None:
-    """Prints a message that is not a result on standard error."""
-    if not quiet:
+def remark(message: str) -> None:
+    """Prints a message that is not a result on standard error, unless `--quiet` is given."""
+    if not is_quiet():
         click.echo(message, err=True)
+
+
+def footnotes(*notes: str) -> None:
+    """Prints what the words of a table mean on standard error: in a terminal, lines as wide as it is."""
+    for note in notes:
+        width = shutil.get_terminal_size().columns if sys.stderr.isatty() else PIPE_WIDTH
+        remark(textwrap.fill(note, width, subsequent_indent="  "))
+
+
+def next_commands(*commands: Sequence[str | Path]) -> None:
+    """Suggests commands; each can be copied to a shell as it is printed."""
+    for command in commands:
+        remark(f"Next: {shlex.join(map(str, command))}")
 
 
 def number(value: float | None) -> str:

@@ -1,39 +1,28 @@
-"""`tcmrl-data inspect`: returns, tasks, snapshots and episodes of a dataset; measures are in `quality.py`."""
+"""`tcmrl-data inspect`: what a dataset holds and how good it is, as tables, JSON and pictures."""
 
 import json
 import math
-from collections.abc import Callable
+import shlex
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from .frame import fail_incomplete, make_table, number, output_options, print_json, print_table, remark
-from .places import DATASET_PATH
+from .groups import Commands
+from .measures import coverage, quality, rewards, transfer, worth
+from .options import DATASET, INDEX, PLOT
 
-Command = TypeVar("Command", bound=Callable[..., Any])
+if TYPE_CHECKING:
+    pass
 
 SHIFTS_SHOWN = 8
 """Parameters whose shift is printed; a walker has more than fifty."""
 
 
-class _Inspections(click.Group):
-    """A group whose error lists its commands if the first argument is a dataset."""
-
-    def resolve_command(
-        self, ctx: click.Context, args: list[str]
-    ) -> tuple[str | None, click.Command | None, list[str]]:
-        if self.get_command(ctx, args[0]) is None and Path(args[0]).exists():
-            choices = "|".join(self.commands)
-            raise click.UsageError(f"Choose a table: `tcmrl-data inspect {choices} {args[0]}`.")
-        return super().resolve_command(ctx, args)
-
-
-@click.group(cls=_Inspections)
+@click.group(cls=Commands)
 def inspect() -> None:
-    """Print what a dataset holds, as tables, JSON or pictures.
-
-    DATASET is the dataset's folder or its manifest.json.
+    """Print returns, tasks, snapshots, episodes or a measure of a dataset.
 
     \b
     Examples:
@@ -42,26 +31,16 @@ def inspect() -> None:
     """
 
 
-def dataset_command(command: Command) -> Command:
-    """Adds the argument DATASET and the options of every inspection."""
-    argument = click.argument("dataset", type=DATASET_PATH)
-    return argument(output_options(command))
-
-
-@inspect.command()
-@dataset_command
-@click.option(
-    "--plot",
-    type=click.Path(path_type=Path, dir_okay=False),
-    metavar="FILE",
-    help="Also plot the learning curves of all tasks to a .png, .svg or .pdf file.",
-)
+@click.command()
+@DATASET
+@output_options
+@PLOT
 @click.option(
     "--recompute",
     is_flag=True,
     help="Compute the returns from the stored rewards and compare them with the recorded ones.",
 )
-def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recompute: bool) -> None:
+def returns(dataset: Path, as_json: bool, plot: Path | None, recompute: bool) -> None:
     """Print undiscounted returns by snapshot, for training and test tasks.
 
     \b
@@ -77,7 +56,7 @@ def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recomp
     table = tcmrl_data.list_returns(opened, recompute=recompute)
     if plot is not None:
         plot_returns(opened, table, plot)
-        remark(f"learning curves written to {plot}", quiet=quiet)
+        remark(f"learning curves written to {plot}")
     if as_json:
         print_json(table)
     else:
@@ -85,7 +64,8 @@ def returns(dataset: Path, as_json: bool, quiet: bool, plot: Path | None, recomp
     if recompute:
         difference = first_disagreement(tcmrl_data.list_returns(opened), table)
         if difference is not None:
-            fail_incomplete(f"{opened.folder}: {difference}; run `tcmrl-data repair {opened.folder} --deep`")
+            command = shlex.join(["tcmrl-data", "verify", str(opened.folder), "--repair", "--deep"])
+            fail_incomplete(f"{opened.folder}: {difference}; run `{command}`")
 
 
 def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:
@@ -110,9 +90,10 @@ def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:
     print_table(table)
 
 
-@inspect.command()
-@dataset_command
-def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
+@click.command()
+@DATASET
+@output_options
+def tasks(dataset: Path, as_json: bool) -> None:
     """Print the tasks with split, parameters and reference returns, and how training and test tasks differ.
 
     The second table has the mean of what orders the tasks, or of each numeric parameter, in training and test
@@ -141,10 +122,10 @@ def tasks(dataset: Path, as_json: bool, quiet: bool) -> None:
         values = (number(known[reference]) for reference in references)
         table.add_row(str(row["task"]), row["split"], _shortened(row["parameters"]), *values)
     print_table(table)
-    _print_shift(document, quiet=quiet)
+    _print_shift(document)
 
 
-def _print_shift(document: dict[str, Any], *, quiet: bool) -> None:
+def _print_shift(document: dict[str, Any]) -> None:
     """Prints the shifts of at most SHIFTS_SHOWN parameters, the largest ones first."""
     rows = sorted(document["shift"], key=_size, reverse=True)
     if not rows:
@@ -159,16 +140,17 @@ def _print_shift(document: dict[str, Any], *, quiet: bool) -> None:
         table.add_row(row["parameter"], *(number(row[column]) for column in columns))
     print_table(table)
     if len(rows) > SHIFTS_SHOWN:
-        remark(f"{len(rows) - SHIFTS_SHOWN} more parameters differ less; --json has all", quiet=quiet)
+        remark(f"{len(rows) - SHIFTS_SHOWN} more parameters differ less; --json has all")
 
 
 def _size(row: dict[str, Any]) -> float:
     return math.inf if row["standardized"] is None else abs(row["standardized"])
 
 
-@inspect.command()
-@dataset_command
-def snapshots(dataset: Path, as_json: bool, quiet: bool) -> None:
+@click.command()
+@DATASET
+@output_options
+def snapshots(dataset: Path, as_json: bool) -> None:
     """Print the snapshots with the ids of their parts.
 
     \b
@@ -190,11 +172,12 @@ def snapshots(dataset: Path, as_json: bool, quiet: bool) -> None:
     print_table(table)
 
 
-@inspect.command()
-@dataset_command
-@click.option("--task", type=click.IntRange(min=0), help="Index of the only task to print.")
-@click.option("--step", type=click.IntRange(min=0), help="Training step of the only snapshots to print.")
-def episodes(dataset: Path, as_json: bool, quiet: bool, task: int | None, step: int | None) -> None:
+@click.command()
+@DATASET
+@output_options
+@click.option("--task", type=INDEX, help="Index of the only task to print.")
+@click.option("--step", type=INDEX, help="Training step of the only snapshots to print.")
+def episodes(dataset: Path, as_json: bool, task: int | None, step: int | None) -> None:
     """Print the episodes with length, return, kind of end and success.
 
     \b
@@ -239,3 +222,11 @@ def _shortened(parameters: dict[str, Any]) -> str:
     return ", ".join(
         f"{key}={json.dumps(shorten(value), ensure_ascii=False)}" for key, value in parameters.items()
     )
+
+
+inspect.fill(
+    {
+        "Contents": [returns, tasks, snapshots, episodes],
+        "Measures": [quality, coverage, rewards, transfer, worth],
+    }
+)

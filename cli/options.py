@@ -1,17 +1,115 @@
-"""Options that several commands take alike."""
+"""Options that several commands take alike, and the types of their values."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar, final
 
 import click
+from click.shell_completion import CompletionItem
 
 from tcmrl_data.recipe import PROFILES
 
-from .places import complete_training_keys
+from .places import DATASET_PATH, complete_training_keys
 
-PROCESSES = click.option(
-    "--workers", type=click.IntRange(min=1), show_default="all cores", help="Number of processes."
+Command = TypeVar("Command", bound=Callable[..., Any])
+
+TIERS = ("random", "medium", "medium-replay", "expert", "medium-expert", "random-expert", "mixed")
+ALL_PROTOCOLS = "all"
+
+
+@final
+class PluginName(click.ParamType):  # type: ignore[type-arg] # generic in newer versions of click only
+    """A name that an installed package declares in an entry point group.
+
+    Help texts and checks read the declared names when they need them, without importing a plug-in.
+
+    Args:
+        group: the entry point group, such as `tcmrl.engines`.
+        noun: kind of plug-in, for error messages.
+        others: further values of the option.
+    """
+
+    name = "name"
+
+    def __init__(self, group: str, noun: str, *, others: Sequence[str] = ()) -> None:
+        self._group, self._noun, self._others = group, noun, others
+
+    def get_metavar(self, param: click.Parameter, ctx: click.Context | None = None) -> str:
+        return f"[{'|'.join(self.known())}]"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        from tcmrl_data.foundation.plugins import unknown_name
+
+        if value not in self.known():
+            raise unknown_name(self._noun, value, self.known())
+        return str(value)
+
+    def shell_complete(
+        self, ctx: click.Context, param: click.Parameter, incomplete: str
+    ) -> list[CompletionItem]:
+        return [CompletionItem(name) for name in self.known() if name.startswith(incomplete)]
+
+    def known(self) -> list[str]:
+        """The names that can be given."""
+        from tcmrl_data.foundation.plugins import declared_names
+
+        return [*declared_names(self._group), *self._others]
+
+
+@final
+class ManyNames(click.Option):
+    """An option whose names are too many for the column of its name; its help lists them."""
+
+    def get_help_record(self, ctx: click.Context) -> tuple[str, str] | None:
+        assert isinstance(self.type, PluginName)
+        record = super().get_help_record(ctx)
+        return record and (record[0], f"{record[1]} One of {', '.join(self.type.known())}.")
+
+
+BEHAVIOR_NAME = PluginName("tcmrl.behavior", "behavior source")
+ENGINE_NAME = PluginName("tcmrl.engines", "engine")
+PROTOCOL_NAME = PluginName("tcmrl.protocols", "protocol")
+PROTOCOL_OR_ALL = PluginName("tcmrl.protocols", "protocol", others=[ALL_PROTOCOLS])
+FORMAT_NAME = PluginName("tcmrl.formats", "format")
+READER_NAME = PluginName("tcmrl.readers", "import format")
+ALGORITHM_NAME = PluginName("tcmrl.algorithms", "algorithm")
+
+PATH = click.Path(path_type=Path)
+FILE = click.Path(path_type=Path, dir_okay=False)
+COUNT = click.IntRange(min=1)
+INDEX = click.IntRange(min=0)
+
+
+def with_options(*decorators: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Adds several arguments and options to a command, in this order."""
+
+    def add(command: Command) -> Command:
+        for decorator in reversed(decorators):
+            command = decorator(command)
+        return command
+
+    return add
+
+
+DATASET = click.argument("dataset", type=DATASET_PATH)
+OUT = click.option("--out", type=PATH, metavar="FOLDER", help="Folder to create.")
+NEW_DATASET = click.option("--out", type=PATH, required=True, metavar="FOLDER", help="Folder to create.")
+LABEL = click.option("--label", help="The new dataset's own name.")
+DRY_RUN = click.option("--dry-run", is_flag=True, help="Only say what would be done; write nothing.")
+WORKERS = click.option(
+    "--workers", type=COUNT, show_default="all cores", help="Number of processes that work at once."
 )
-SIMULTANEOUS_RUNS = click.option(
-    "--workers", type=click.IntRange(min=1), show_default="one per core", help="Number of simultaneous runs."
+TASKS = click.option("--tasks", metavar="LIST", help="Only these tasks, such as 0-9,12.")
+SPLIT = click.option("--split", type=click.Choice(["train", "test"]), help="Only tasks of this split.")
+TIER = click.option("--tier", type=click.Choice(TIERS), metavar="NAME", help=f"Tier: {', '.join(TIERS)}.")
+SNAPSHOTS = click.option(
+    "--snapshots",
+    default="all",
+    show_default=True,
+    metavar="RULE",
+    help="Instead of a tier: all, last, steps>=N, or return>=Q with a quantile Q.",
 )
+PLOT = click.option("--plot", type=FILE, metavar="FILE", help="Also draw a .png, .svg or .pdf file.")
 TRAINING_PROFILE = click.option(
     "--profile",
     type=click.Choice(PROFILES),
@@ -26,6 +124,28 @@ TRAINING_SETTINGS = click.option(
     multiple=True,
     help="Override a training setting; repeatable.",
 )
-DEVICE = click.option(
-    "--device", default="cpu", show_default=True, help="PyTorch device, such as cpu or cuda."
-)
+DEVICE = click.option("--device", default="cpu", show_default=True, help="PyTorch device: cpu, cuda, …")
+
+
+def allow_only(context: click.Context, mode: str, *names: str) -> None:
+    """Refuses typed options that mean nothing beside another one.
+
+    Args:
+        context: of the command.
+        mode: the other option.
+        names: parameters that go with it.
+    """
+    allowed = {*names, "as_json", "quiet"}
+    typed = click.core.ParameterSource.COMMANDLINE
+    for option in context.command.params:
+        name = str(option.name)
+        is_other = isinstance(option, click.Option) and name not in allowed and option.opts[0] != mode
+        if is_other and context.get_parameter_source(name) == typed:
+            raise click.UsageError(f"{option.opts[0]} does not go with {mode}; omit one of them.")
+
+
+def indices(text: str | None, option: str = "--tasks") -> list[int] | None:
+    """The indices in a LIST, such as 0-9,12."""
+    from tcmrl_data import MAX_TASKS, parse_indices
+
+    return None if text is None else parse_indices(text, MAX_TASKS, option=option)

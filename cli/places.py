@@ -93,7 +93,7 @@ def complete_training_keys(
     ctx: click.Context, param: click.Parameter, incomplete: str
 ) -> list[CompletionItem]:
     """Keys of `--set`: those of the training tables that the typed dataset has."""
-    file = Path(_first_argument(ctx, "manifest"))
+    file = Path(_first_argument(ctx, "dataset"))
     tables: dict[str, Any] = {}
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, AttributeError):
         file = file if file.name == MANIFEST_FILE else file / MANIFEST_FILE

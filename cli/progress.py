@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Self, TypeVar
 
 import click
 
-from .frame import duration, same_command, stopped_by_signals
+from .frame import duration, is_quiet, same_command, stopped_by_signals
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -66,12 +66,12 @@ class StageProgress:
     """Shows the progress of a job's stages, with rate and remaining time.
 
     Example:
-        >>> with StageProgress(quiet=True) as progress:
+        >>> with StageProgress() as progress:
         ...     progress.update("training", done=10, total=100, unit="steps")
     """
 
-    def __init__(self, *, quiet: bool = False) -> None:
-        self._quiet = quiet
+    def __init__(self) -> None:
+        self._quiet = is_quiet()
         self._bars: Progress | None = None
         self._bar_of: dict[str, TaskID] = {}
         self._paces: dict[str, Pace] = {}
@@ -138,9 +138,9 @@ class StageProgress:
         click.echo(f"{stage}: {done:,.0f} of {total:,.0f} {unit}{rate}{detail}{left}", err=True)
 
 
-def with_progress(work: Callable[[PartsProgress], Made], *, stage: str, out: Path, quiet: bool) -> Made:
+def with_progress(work: Callable[[PartsProgress], Made], *, stage: str, out: Path) -> Made:
     """Calls a function that reports its progress; Ctrl-C says what is kept in `out` and how to go on."""
-    with stopped_by_signals(lambda: same_command(out)), StageProgress(quiet=quiet) as progress:
+    with stopped_by_signals(lambda: same_command(out)), StageProgress() as progress:
         return work(lambda done, total: progress.update(stage, done=done, total=total, unit="parts"))
 
 

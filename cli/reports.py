@@ -1,11 +1,13 @@
-"""`tcmrl report`: tables, figures and verdicts on finished runs, rows of them, and a page of such rows."""
+"""`tcmrl report` and `runs`: what finished runs say, and which runs there are."""
 
 import dataclasses
 from pathlib import Path
+from typing import Any
 
 import click
 
-from .frame import output_options, print_json, remark
+from .frame import make_table, number, output_options, print_json, print_table, remark
+from .options import FILE, PATH
 from .places import RUN_PATH
 from .progress import StageProgress
 
@@ -14,33 +16,28 @@ from .progress import StageProgress
 @click.argument("runs", metavar="RUNS...", nargs=-1, required=True, type=RUN_PATH)
 @click.option(
     "--out",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FOLDER",
     show_default="report in the first of RUNS; of an earlier report itself; of a table its folder",
     help="Folder of the report.",
 )
 @click.option(
     "--rows",
-    type=click.Path(path_type=Path, dir_okay=False),
+    type=FILE,
     metavar="FILE",
     help="Also add the runs to this table of results, such as results/runs.csv.",
 )
 @click.option(
     "--dataset",
     "datasets",
-    type=click.Path(path_type=Path),
+    type=PATH,
     metavar="FOLDER",
     multiple=True,
     help="Folder of a dataset that was moved after the training of RUNS; repeatable.",
 )
 @output_options
 def report(
-    runs: tuple[Path, ...],
-    out: Path | None,
-    rows: Path | None,
-    datasets: tuple[Path, ...],
-    as_json: bool,
-    quiet: bool,
+    runs: tuple[Path, ...], out: Path | None, rows: Path | None, datasets: tuple[Path, ...], as_json: bool
 ) -> None:
     """Write a report on finished runs.
 
@@ -68,7 +65,7 @@ def report(
     \b
     Examples:
       tcmrl report results/perspectives
-      tcmrl report results/perspectives results/window_length --out reports/ablations
+      tcmrl report results/perspectives results/window_length --out both
       tcmrl report runs/point-robot-tcmrl-seed0 --out report
       tcmrl report results/perspectives --dataset /disk/point-robot
       tcmrl report results/perspectives --rows results/runs.csv
@@ -83,7 +80,7 @@ def report(
     if rows is not None and (runs[0].suffix == ".json" or (runs[0] / "tuning.json").is_file()):
         _add(runs, rows, as_json=as_json)
         return
-    with StageProgress(quiet=quiet) as progress:
+    with StageProgress() as progress:
         written = write_report(
             runs,
             out or _default_out(runs[0]),
@@ -101,10 +98,7 @@ def report(
     click.echo(f"{written.report}: written, with {len(written.files) - 1} other files")
     if rows is not None:
         click.echo(f"{rows}: the runs are in it; `tcmrl report {rows}` writes its page")
-    remark(
-        "Verdicts compare methods run by run, corrected for the number of verdicts by Holm's method.",
-        quiet=quiet,
-    )
+    remark("Verdicts compare methods run by run, corrected for the number of verdicts by Holm's method.")
 
 
 def _write_page(tables: tuple[Path, ...], out: Path | None, rows: Path | None, *, as_json: bool) -> None:
@@ -132,3 +126,50 @@ def _add(sources: tuple[Path, ...], rows: Path, *, as_json: bool) -> None:
 
 def _default_out(folder: Path) -> Path:
     return folder if (folder / "report.md").is_file() else folder / "report"
+
+
+@click.command()
+@click.argument("folder", type=PATH, required=False)
+@output_options
+def runs(folder: Path | None, as_json: bool) -> None:
+    """List the runs in FOLDER (default: runs) and its subfolders.
+
+    \b
+    Examples:
+      tcmrl runs
+      tcmrl runs results/perspectives --json
+    """
+    from tcmrl_algo.training.listing import list_runs
+
+    if folder is not None and not folder.is_dir():
+        raise click.ClickException(f"{folder} is not a folder; name a folder that contains runs")
+    folder = folder or Path("runs")
+    rows = list_runs(folder)
+    if as_json:
+        print_json({"runs": rows})
+        return
+    if not rows:
+        remark(f"no runs in {folder}; train one with `tcmrl train DATASET`")
+        return
+    table = make_table(
+        f"Runs in {folder}",
+        columns=["run", "trained", "steps", "dataset", "last return"],
+        text=["dataset"],
+        long_text=["run", "trained"],
+    )
+    for row in rows:
+        table.add_row(*_cells(row))
+    print_table(table)
+
+
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    if "error" in row:
+        return row["path"], f"unreadable: {row['error']}", "", "", ""
+    evaluation = row["evaluation"]
+    return (
+        row["path"],
+        f"{row['algorithm']} on {row['environment']}, seed {row['seed']}",
+        f"{row['step']:,}/{row['steps']:,}",
+        row["root"][:12],
+        f"{evaluation['protocol']} {number(evaluation['final'])}" if evaluation else "–",
+    )

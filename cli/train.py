@@ -8,26 +8,30 @@ import click
 
 from tcmrl_data.recipe import Profile
 
-from .completion import completion
-from .controls import controls
-from .evaluation import evaluate
-from .experiments import experiment
+from .evaluation import controls, evaluate
+from .experiments import experiment, tune
 from .frame import (
     duration,
     main_program,
+    next_commands,
     output_options,
     print_json,
-    remark,
     stopped_by_signals,
     typed_command,
 )
-from .options import TRAINING_PROFILE, TRAINING_SETTINGS
-from .places import DATASET_PATH
-from .plugins import ALGORITHM
+from .groups import SETTINGS, Commands
+from .options import (
+    ALGORITHM_NAME,
+    COUNT,
+    DATASET,
+    INDEX,
+    PATH,
+    TRAINING_PROFILE,
+    TRAINING_SETTINGS,
+    ManyNames,
+)
 from .progress import StageProgress
-from .reports import report
-from .runs import runs
-from .tuning import tune
+from .reports import report, runs
 
 if TYPE_CHECKING:
     from tcmrl_algo import TrainingConfig, TrainingProgress, TrainingReport
@@ -39,7 +43,7 @@ def main() -> None:
     main_program(tcmrl)
 
 
-@click.group(name="tcmrl", context_settings={"help_option_names": ["-h", "--help"], "max_content_width": 100})
+@click.group(name="tcmrl", cls=Commands, context_settings=SETTINGS)
 @click.version_option(package_name="tcmrl")
 def tcmrl() -> None:
     """Meta-train on a dataset of `tcmrl-data build`, and adapt to its test tasks.
@@ -57,22 +61,21 @@ def tcmrl() -> None:
     """
 
 
-tcmrl.add_command(completion)
-tcmrl.add_command(controls)
-tcmrl.add_command(evaluate)
-tcmrl.add_command(experiment)
-tcmrl.add_command(report)
-tcmrl.add_command(runs)
-tcmrl.add_command(tune)
-
-
-@tcmrl.command()
-@click.argument("manifest", metavar="MANIFEST", type=DATASET_PATH)
-@click.option("--algo", type=ALGORITHM, show_default="the recipe's", help="Method to train.")
+@click.command()
+@DATASET
+@click.option(
+    "--algo",
+    cls=ManyNames,
+    type=ALGORITHM_NAME,
+    metavar="NAME",
+    show_default="the recipe's",
+    help="Method to train.",
+)
 @TRAINING_PROFILE
 @click.option(
-    "--steps",
-    type=click.IntRange(min=1),
+    "--stop-at",
+    type=COUNT,
+    metavar="STEP",
     show_default="run.steps",
     help="Step to stop at; schedules and stages still have the length of run.steps.",
 )
@@ -85,20 +88,16 @@ tcmrl.add_command(tune)
 )
 @TRAINING_SETTINGS
 @click.option("--resume", is_flag=True, help="Continue from the newest checkpoint in --out.")
-@click.option("--seed", type=click.IntRange(min=0), show_default="0", help="Seed of all random numbers.")
+@click.option("--seed", type=INDEX, show_default="0", help="Seed of all random numbers.")
 @click.option(
-    "--out",
-    type=click.Path(path_type=Path),
-    metavar="FOLDER",
-    show_default="runs/ENV-ALGO-seedSEED",
-    help="Folder of the run.",
+    "--out", type=PATH, metavar="FOLDER", show_default="runs/ENV-ALGO-seedSEED", help="Folder of the run."
 )
 @output_options
 def train(
-    manifest: Path,
+    dataset: Path,
     algo: str | None,
     profile: Profile | None,
-    steps: int | None,
+    stop_at: int | None,
     device: str | None,
     memory_limit: str | None,
     overrides: tuple[str, ...],
@@ -106,14 +105,13 @@ def train(
     seed: int | None,
     out: Path | None,
     as_json: bool,
-    quiet: bool,
 ) -> None:
     """Meta-train on the training tasks of a dataset.
 
-    MANIFEST is the dataset's folder or its manifest.json. The training settings are those of the dataset's
-    recipe; --set overrides single values. Ctrl-C, SIGTERM and SIGHUP save a checkpoint and end the run;
-    SIGUSR1 saves one, and the run continues. --resume continues a run that was stopped or killed; the result
-    is that of an uninterrupted run.
+    DATASET is the dataset's folder, its manifest.json or a view. The training settings are those of the
+    dataset's recipe; --set overrides single values. Ctrl-C, SIGTERM and SIGHUP save a checkpoint and end the
+    run; SIGUSR1 saves one, and the run continues. --resume continues a run that was stopped or killed; the
+    result is that of an uninterrupted run.
 
     \b
     Examples:
@@ -125,21 +123,21 @@ def train(
     from tcmrl_data import open_dataset, parse_bytes
 
     limit = parse_bytes(memory_limit) if memory_limit else None
-    if resume and not manifest.exists():
-        raise click.ClickException(f"{manifest} does not exist; name the present folder of the run's dataset")
-    dataset = open_dataset(manifest)
-    config = _config(dataset, algo=algo, profile=profile, overrides=overrides)
-    folder = out or Path("runs") / f"{dataset.name}-{config.settings.run.algorithm}-seed{seed or 0}"
-    with stopped_by_signals(lambda: _how_to_continue(folder)), StageProgress(quiet=quiet) as progress:
+    if resume and not dataset.exists():
+        raise click.ClickException(f"{dataset} does not exist; name the present folder of the run's dataset")
+    opened = open_dataset(dataset)
+    config = _config(opened, algo=algo, profile=profile, overrides=overrides)
+    folder = out or Path("runs") / f"{opened.name}-{config.settings.run.algorithm}-seed{seed or 0}"
+    with stopped_by_signals(lambda: _how_to_continue(folder)), StageProgress() as progress:
         if resume:
             report = _resume(
                 folder,
-                dataset,
+                opened,
                 algo=algo,
                 profile=profile,
                 overrides=overrides,
                 seed=seed,
-                steps=steps,
+                steps=stop_at,
                 device=device,
                 memory_limit=limit,
                 progress=progress,
@@ -147,16 +145,16 @@ def train(
         else:
             report = _train(
                 folder,
-                dataset,
+                opened,
                 config=config,
-                profile=profile or dataset.manifest.profile,
+                profile=profile or opened.manifest.profile,
                 seed=seed or 0,
-                steps=steps,
+                steps=stop_at,
                 device=device or "cpu",
                 memory_limit=limit,
                 progress=progress,
             )
-    _print_training(report, as_json=as_json, quiet=quiet)
+    _print_training(report, as_json=as_json)
 
 
 def _config(
@@ -274,7 +272,7 @@ def _show(progress: StageProgress, event: "TrainingProgress") -> None:
     progress.update("training", done=event.step, total=event.steps, unit="steps", detail=detail)
 
 
-def _print_training(report: "TrainingReport", *, as_json: bool, quiet: bool) -> None:
+def _print_training(report: "TrainingReport", *, as_json: bool) -> None:
     record = report.run.record
     algorithm = record.config.settings.run.algorithm
     if as_json:
@@ -295,4 +293,7 @@ def _print_training(report: "TrainingReport", *, as_json: bool, quiet: bool) -> 
         f"{report.run.folder}: {algorithm} on {record.environment}, seed {record.seed}, "
         f"{report.step:,} steps in {duration(report.seconds)}, tensors {report.digest[:12]}"
     )
-    remark(f"Next: tcmrl evaluate {report.run.folder}", quiet=quiet)
+    next_commands(["tcmrl", "evaluate", report.run.folder])
+
+
+tcmrl.fill({"Train": [train, tune, experiment], "Look": [evaluate, controls, report, runs]})

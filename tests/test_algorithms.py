@@ -281,7 +281,7 @@ def test_a_method_of_another_package_trains_resumes_and_evaluates_by_the_command
     digests = []
     for folder, stops in (("straight", (8,)), ("stopped", (3, 8))):
         for stop in stops:
-            more = ["--steps", stop, "--out", tmp_path / folder]
+            more = ["--stop-at", stop, "--out", tmp_path / folder]
             resumed = ["train", tiny_folder, "--resume", "--json", *more]
             code, output, errors = call(*(resumed if stop != stops[0] else [*common, *more]))
             assert code == 0, errors

@@ -34,7 +34,7 @@ def refusal(path: Path) -> str:
     with pytest.raises(StoreError) as refused:
         read_all(path)
     message = str(refused.value)
-    assert message.startswith(str(path)) and message.endswith("; run `tcmrl-data repair`")
+    assert message.startswith(str(path)) and message.endswith("; run `tcmrl-data verify --repair`")
     assert message.isprintable()
     return message
 

@@ -109,7 +109,7 @@ def test_a_recorded_part_that_is_gone_or_cut_is_left_to_repair(
     file.unlink()
     if problem != "is missing":
         file.write_bytes(b"PK\x03\x04...")
-    with pytest.raises(StoreError, match=f"{file} {problem}.*; run `tcmrl-data repair {folder}`"):
+    with pytest.raises(StoreError, match=f"{file} {problem}.*; run `tcmrl-data verify {folder} --repair`"):
         tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
     assert tcmrl_data.repair_dataset(folder, workers=1).repaired == (PartKey(40, 150),)
     assert tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS).present == 15
@@ -214,7 +214,7 @@ def test_a_flipped_bit_of_a_table_stops_the_build_and_names_the_file(
     data = bytearray(file.read_bytes())
     data[len(data) // 2] ^= 1
     file.write_bytes(data)
-    with pytest.raises(ManifestError, match=f"{file}: its first .*; run `tcmrl-data repair`"):
+    with pytest.raises(ManifestError, match=f"{file}: its first .*; run `tcmrl-data verify --repair`"):
         tcmrl_data.build_dataset(tiny_recipe, file.parent, tasks=TASKS)
 
 

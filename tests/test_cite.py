@@ -109,7 +109,7 @@ def test_a_licence_that_cff_does_not_know_stands_in_the_abstract(tiny: Dataset) 
 
 def test_the_text_names_authors_version_and_works(tiny: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
     call = in_process(data, capsys)
-    code, output, _ = call("cite", tiny.folder, "--format", "text")
+    code, output, _ = call("card", tiny.folder, "--format", "text")
     first, *works, software = output.splitlines()
     assert code == 0
     assert first.startswith("the tcmrl authors: point-robot: a dataset for offline")
@@ -120,7 +120,7 @@ def test_the_text_names_authors_version_and_works(tiny: Dataset, capsys: pytest.
         "Machine Learning, 2019. https://arxiv.org/abs/1903.08254"
     ]
     assert software.startswith("the tcmrl authors: tcmrl")
-    assert call("cite", tiny.folder)[1] == citation_text(tiny.manifest, "bibtex")
+    assert call("card", tiny.folder, "--format", "bibtex")[1] == citation_text(tiny.manifest, "bibtex")
 
 
 def test_the_softwares_own_cff_parses() -> None:

@@ -60,10 +60,28 @@ def test_build_reports_and_a_second_build_finds_everything(call: Call, tmp_path:
     report = json.loads(output)
     assert (code, errors) == (0, "")
     assert (report["built"], report["present"], report["failed"]) == (6, 0, [])
-    code, output, _ = call(*command, "--quiet")
-    assert code == 0
+    code, output, errors = call(*command)
+    assert (code, "--profile" in errors) == (0, False)
     assert "0 parts built, 6 already present" in output
     assert report["root"][:12] in output
+
+
+def test_a_build_says_what_its_profile_takes_and_what_the_others_would(call: Call, tmp_path: Path) -> None:
+    command = [
+        "build",
+        "point-robot",
+        "--profile",
+        "quick",
+        *SETTINGS,
+        "--tasks",
+        "0",
+        "--out",
+        tmp_path / "d",
+    ]
+    code, _, errors = call(*command)
+    lines = errors.splitlines()
+    assert (code, lines[0]) == (0, "this build: 1 task, 150 steps of training, 3 parts, 8.3 kB at most")
+    assert lines[1].startswith("--profile paper: 1 task, 150 steps of training")
 
 
 def test_a_recipe_file_of_ones_own_builds_a_dataset_of_its_environment(
@@ -81,11 +99,11 @@ def test_a_recipe_file_of_ones_own_builds_a_dataset_of_its_environment(
     assert_refused(call("build", "point-robot", *command[2:]), "behavior.settings.gamma is 0.8 there")
 
 
-def test_a_recipe_file_that_is_none_is_refused_by_build_and_plan(call: Call, tmp_path: Path) -> None:
+def test_a_recipe_file_that_is_none_is_refused(call: Call, tmp_path: Path) -> None:
     (tmp_path / "empty.toml").write_text("schema = 1\n")
-    for command in ("build", "plan"):
-        assert_refused(call(command, tmp_path / "nowhere.toml"), "nowhere.toml does not exist")
-        assert_refused(call(command, tmp_path / "empty.toml"), "[environment] has no name")
+    for options in ((), ("--plan",), ("--recipe",)):
+        assert_refused(call("build", tmp_path / "nowhere.toml", *options), "nowhere.toml does not exist")
+        assert_refused(call("build", tmp_path / "empty.toml", *options), "[environment] has no name")
 
 
 def test_a_build_with_failing_units_ends_with_one_and_says_which(
@@ -98,7 +116,7 @@ def test_a_build_with_failing_units_ends_with_one_and_says_which(
         )
 
     monkeypatch.setattr(tcmrl_data, "build_dataset", fail)
-    code, output, errors = call("build", "point-robot", "--out", tmp_path / "d")
+    code, output, errors = call("build", "point-robot", "--out", tmp_path / "d", "--quiet")
     assert code == 1
     assert "3 parts built" in output
     assert len(errors.strip().splitlines()) == 1
@@ -168,7 +186,7 @@ BUILD = ("build", "point-robot", "--profile", "quick")
     ("arguments", "expected"),
     [
         (("build", "point-robt"), ["point-robt", "point-robot", "sparse-point-robot"]),
-        (("plan", "ml1/reech"), ["ml1/reech", "ml1/reach"]),
+        (("build", "ml1/reech", "--plan"), ["ml1/reech", "ml1/reach"]),
         ((*BUILD, "--set", "rollouts.episods=3"), ["episods"]),
         ((*BUILD, "--set", "rolouts.episodes=3"), ["rolouts", "rollouts"]),
         ((*BUILD, "--set", "rollouts.episodes=many"), ["rollouts", "episodes", "integer", "many"]),
@@ -251,7 +269,7 @@ def test_every_help_has_an_example(call: Call) -> None:
 def test_no_arguments_prints_help_and_exits_with_two(call: Call) -> None:
     code, output, errors = call()
     assert (code, output) == (2, "")
-    assert "Commands:" in errors
+    assert "Make:" in errors
 
 
 def test_a_dataset_whose_environment_is_not_installed_is_still_listed_and_inspected(
@@ -275,13 +293,15 @@ def test_a_dataset_whose_environment_is_not_installed_is_still_listed_and_inspec
 def test_recipe_prints_the_values_of_a_recipe_as_json(call: Call, tmp_path: Path) -> None:
     text = ENVIRONMENTS.get("point-robot").recipe_file("point-robot").read_text(encoding="utf-8")
     (tmp_path / "mine.toml").write_text(text)
-    code, output, errors = call("recipe", tmp_path / "mine.toml", "--profile", "quick", "--json")
+    code, output, errors = call("build", tmp_path / "mine.toml", "--recipe", "--profile", "quick", "--json")
     document = json.loads(output)
     assert (code, errors, list(document)) == (0, "", ["environment", "profile", "values"])
     assert (document["environment"], document["profile"]) == ("point-robot", "quick")
     assert {"key": "environment.horizon", "value": 20, "source": "published code"} in document["values"]
-    assert json.loads(call("recipe", "point-robot", "--profile", "quick", "--json")[1]) == document
-    assert_refused(call("recipe", "point-robot", "--set", "rollouts.lane=1"), "rollouts.lane", "lanes")
+    assert json.loads(call("build", "point-robot", "--recipe", "--profile", "quick", "--json")[1]) == document
+    assert_refused(
+        call("build", "point-robot", "--recipe", "--set", "rollouts.lane=1"), "rollouts.lane", "lanes"
+    )
 
 
 def test_a_command_without_an_output_ends_in_silence(tiny_folder: Path) -> None:

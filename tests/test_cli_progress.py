@@ -6,7 +6,7 @@ from pathlib import Path
 import click
 import pytest
 from tcmrl_cli.data import data
-from tcmrl_cli.frame import duration
+from tcmrl_cli.frame import duration, output_options
 from tcmrl_cli.progress import Pace, StageProgress
 
 from tcmrl_data.foundation.machine import size
@@ -88,10 +88,15 @@ def test_a_long_stage_says_its_time_left_after_a_minute(monkeypatch: pytest.Monk
 
 
 def test_quiet_progress_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    with StageProgress(quiet=True) as progress:
-        progress.update("training", done=10, total=10, unit="steps")
-        progress.note("something")
-    assert capsys.readouterr() == ("", "")
+    @click.command()
+    @output_options
+    def training(as_json: bool) -> None:
+        with StageProgress() as progress:
+            progress.update("training", done=10, total=10, unit="steps")
+            progress.note("something")
+
+    assert in_process(training, capsys)("--quiet") == (0, "", "")
+    assert in_process(training, capsys)()[2] == "something\n"
 
 
 @pytest.mark.parametrize(

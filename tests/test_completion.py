@@ -43,8 +43,8 @@ def scripts(tmp_path_factory: pytest.TempPathFactory, environment: dict[str, str
     """A folder with the bash script of each program."""
     folder = tmp_path_factory.mktemp("scripts")
     for program in PROGRAMS:
-        command = [program, "completion", "bash"]
-        result = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        environment |= {f"_{program}_COMPLETE".replace("-", "_").upper(): "bash_source"}
+        result = subprocess.run(program, env=environment, capture_output=True, text=True, check=True)
         assert result.stderr == ""
         (folder / program).write_text(result.stdout)
     return folder
@@ -106,8 +106,9 @@ def test_the_members_of_a_family_follow_its_slash(
 def test_the_scripts_of_other_shells_are_sound(
     shell: str, environment: dict[str, str], tmp_path: Path
 ) -> None:
-    command = ["tcmrl-data", "completion", shell]
-    script = subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+    environment |= {"_TCMRL_DATA_COMPLETE": f"{shell}_source"}
+    result = subprocess.run("tcmrl-data", env=environment, capture_output=True, text=True, check=True)
+    script = result.stdout
     assert f"_TCMRL_DATA_COMPLETE={shell}_complete" in script
     if shutil.which(shell) is None:
         pytest.skip(f"{shell} is not installed")

@@ -84,8 +84,8 @@ def test_a_view_needs_a_folder_of_its_own(
     view = tmp_path / "view.json"
     tcmrl_data.derive_dataset(tiny, view=view, tasks=[0, 3], snapshots="last")
     call = in_process(data, capsys)
-    code, _, errors = call("croissant", view)
+    code, _, errors = call("card", view, "--format", "croissant")
     assert (code, errors.count("\n")) == (2, 1) and "--out" in errors
     assert not (tiny.folder / CROISSANT).exists()
-    code, output, _ = call("croissant", view, "--out", tmp_path / "c")
+    code, output, _ = call("card", view, "--format", "croissant", "--out", tmp_path / "c")
     assert code == 0 and output == f"{tmp_path / 'c' / CROISSANT}: 2 tasks, 2 parts\n"

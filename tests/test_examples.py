@@ -126,7 +126,7 @@ def test_the_environment_of_a_users_package_is_built_and_verified(
 def test_the_method_of_a_users_package_is_trained_and_evaluated(
     installation: Installation, pendulum: Path, tmp_path: Path
 ) -> None:
-    options = ["--algo", "reward_regression", "--steps", 10, "--quiet", *_set(SHORT)]
+    options = ["--algo", "reward_regression", "--stop-at", 10, "--quiet", *_set(SHORT)]
     installation.call("tcmrl", "train", pendulum, *options, "--out", tmp_path / "run")
     document = json.loads(installation.call("tcmrl", "evaluate", tmp_path / "run", "--json"))
     assert document["algorithm"] == "reward_regression"

@@ -180,7 +180,7 @@ def test_a_part_in_the_way_is_named_and_a_damaged_one_made_again(tiny_copy: Copy
     place = folder / "parts/extended/00000/0000150.zip"
     place.parent.mkdir(parents=True)
     shutil.copy(folder / "parts/main/00000/0000150.zip", place)
-    with pytest.raises(BuildError, match="holds another part; delete it or choose another --run"):
+    with pytest.raises(BuildError, match="holds another part; delete it or choose another --as"):
         extend_dataset(folder, episodes=3, tasks=[0], workers=1)
     place.write_bytes(place.read_bytes()[:3000])
     assert extend_dataset(folder, episodes=3, tasks=[0], workers=1).root == expected

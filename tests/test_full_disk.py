@@ -77,7 +77,7 @@ def test_a_finished_dataset_that_is_read_only_needs_no_build_and_no_repair(tiny_
     assert built.returncode == 0, built.stderr
     report = json.loads(built.stdout)
     assert (report["built"], report["present"], report["read_only"]) == (0, 15, True)
-    repaired = run_mounted(read_only(tiny_folder), "repair", tiny_folder)
+    repaired = run_mounted(read_only(tiny_folder), "verify", tiny_folder, "--repair")
     assert repaired.returncode == 0, repaired.stderr
     assert "0 parts regenerated" in repaired.stdout and "cannot be written" in repaired.stdout
 
@@ -91,7 +91,7 @@ def test_a_read_only_dataset_that_lacks_parts_is_refused_by_name(tiny_copy: Call
     assert more.returncode == 2
     assert more.stderr.startswith(f"Error: {copy} cannot be written") and more.stderr.count("\n") == 1
     shutil.rmtree(copy / "parts" / "main" / "00003")
-    damaged = run_mounted(read_only(copy), "repair", copy, "--quiet")
+    damaged = run_mounted(read_only(copy), "verify", copy, "--repair", "--quiet")
     assert damaged.returncode == 2
     assert damaged.stderr.startswith(f"Error: {copy} cannot be written") and damaged.stderr.count("\n") == 1
 

@@ -1,4 +1,4 @@
-"""gc removes only unused files; what the commands of verification print."""
+"""`verify --clean` removes only unused files; what the commands of verification print."""
 
 import json
 import subprocess
@@ -80,13 +80,13 @@ def test_the_commands_say_what_they_found_and_did(
     assert document["findings"] == [
         {"file": name, "problem": "is missing", "task": 3, "step": 0, "run": "main", "foreign": False}
     ]
-    assert run(data, ["repair", str(folder), "--workers", "1", "--quiet"]) == 0
+    assert run(data, ["verify", str(folder), "--repair", "--workers", "1", "--quiet"]) == 0
     assert "task 3, step 0, run main: regenerated, same id" in capsys.readouterr().out
     littered(folder)
-    assert run(data, ["gc", str(folder), "--dry-run", "--json"]) == 0
+    assert run(data, ["verify", str(folder), "--clean", "--dry-run", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["bytes"] == 13
-    assert run(data, ["gc", str(folder)]) == 0
+    assert run(data, ["verify", str(folder), "--clean"]) == 0
     assert "3 items, 13 B removed" in capsys.readouterr().out
-    for command in (["verify", "--quick", "--deep"], ["verify"], ["repair"], ["gc"]):
-        assert run(data, [command[0], str(folder / "parts/main"), *command[1:]]) == 2
+    for options in (["--quick", "--deep"], [], ["--repair"], ["--clean"]):
+        assert run(data, ["verify", str(folder / "parts/main"), *options]) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1

@@ -48,8 +48,8 @@ COMMANDS = [
     "inspect episodes",
     "inspect returns",
     "list",
-    "status",
-    "gc --dry-run",
+    "show",
+    "verify --clean --dry-run",
     "verify --quiet --strict",
 ]
 Findings = tuple[Finding, ...]
@@ -267,14 +267,14 @@ def test_nothing_is_written_through_a_link(forge: Forge, name: str, command: str
     assert files_of(forge.outside) == before
 
 
-def test_status_shows_a_strangers_record_without_obeying_it(
+def test_show_prints_a_strangers_record_without_obeying_it(
     forge: Forge, capsys: pytest.CaptureFixture[str]
 ) -> None:
     status = {"time": 1.0, "parts_done": 0, "parts_total": 1, "steps_done": 0, "steps_total": 1}
     status |= {"running": [], "warnings": [], "num_failed": 1, "steps_per_second": None}
     for failed in ("c\x1b[2J[red]",), ({},):
         (forge.folder / "status.json").write_text(json.dumps({**status, "failed": failed}))
-        assert run(data, ["status", str(forge.folder)]) == 0
+        assert run(data, ["show", str(forge.folder)]) == 0
     printed = capsys.readouterr().out
     assert r"c\x1b[2J[red]" in printed
     assert printed.count("failed") == 1

@@ -247,7 +247,7 @@ def test_the_command(exported: list[Path], tmp_path: Path, capsys: pytest.Captur
         (["--option", "layout=lerobot"], "layout"),
         (["--option", "layout"], "expected NAME=VALUE"),
         (["--environment", "nowhere"], "unknown environment 'nowhere'"),
-        (["--tasks", str(tmp_path / "no.json")], "no.json cannot be read"),
+        (["--task-file", str(tmp_path / "no.json")], "no.json cannot be read"),
         ([str(tmp_path / "no.hdf5")], "no.hdf5 cannot be read"),
         ([str(exported[0])], "is in the files twice"),
     ):

@@ -42,7 +42,7 @@ COMPLETIONS = (
 HELPS = ("tcmrl-data --help", "tcmrl-data build --help", "tcmrl train --help", "tcmrl evaluate --help")
 LOOKS = (
     "tcmrl-data envs",
-    "tcmrl-data recipe point-robot --profile quick",
+    "tcmrl-data build point-robot --recipe --profile quick",
     "tcmrl-data list data",
     "tcmrl-data inspect returns data/point-robot",
     "tcmrl-data inspect returns data/point-robot --recompute",

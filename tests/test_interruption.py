@@ -108,7 +108,7 @@ def test_the_command_that_an_interrupted_training_prints_goes_on(
     assert line.startswith(f"Error: interrupted; to continue from step {step:,}, run `tcmrl train ")
     again = shlex.split(re.search("`(.*)`", line)[1])[1:]  # type: ignore[index]
     assert again == [*typed, "--resume"]
-    code, _, errors = call(*again, "--steps", step + 5)
+    code, _, errors = call(*again, "--stop-at", step + 5)
     assert (code, f"going on from step {step:,}" in errors) == (0, True)
     assert open_run(folder).newest().step == step + 5
 
@@ -140,7 +140,7 @@ def test_resuming_takes_the_settings_of_the_run_and_no_others(
 ) -> None:
     folder = tmp_path / "run"
     train_run(tiny, folder, config=config_of(tiny), profile="quick", steps=5)
-    again = ("train", tiny_folder, "--out", folder, "--steps", 10)
+    again = ("train", tiny_folder, "--out", folder, "--stop-at", 10)
     assert_refused(call(*again), "--resume")
     gone = ("train", tmp_path / "gone", "--resume", "--out", folder)
     assert_refused(call(*gone), "gone", "present folder of the run's dataset")

@@ -125,7 +125,7 @@ def test_status_of_a_dataset_that_can_only_be_read(tiny_folder: Path, tmp_path: 
     folder = tmp_path / "data"  # other tests lock the shared one
     shutil.copytree(tiny_folder, folder)
     with lock_file(folder / LOCK, "dataset"):
-        result = run_mounted(read_only(folder), "status", folder, "--json")
+        result = run_mounted(read_only(folder), "show", folder, "--json")
     assert result.returncode == 0, result.stderr
     assert f"process {os.getpid()} on " in result.stdout
     assert build_status(folder).builder is None

@@ -40,7 +40,7 @@ def test_what_is_written_is_read(
         assert (dataset.snapshots(task), dataset.missing(task)) == (list(steps), [])
     assert PartKey(num_tasks, steps[0]) not in dataset.parts
     (row,) = json.loads(call("list", tmp_path, "--json")[1])["datasets"]
-    status = json.loads(call("status", folder, "--json")[1])
+    status = json.loads(call("show", folder, "--json")[1])["build"]
     assert (row["tasks"], row["parts"], row["root"]) == (num_tasks, num_parts, written.root)
     assert (status["parts_done"], status["parts_total"], status["complete"]) == (num_parts, num_parts, True)
     tables = json.loads(call("inspect", "returns", folder, "--json")[1])["tasks"]

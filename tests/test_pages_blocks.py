@@ -84,7 +84,7 @@ def examples_of(command: click.Command) -> Iterator[tuple[str, ...]]:
         (("tcmrl-data", "bild", "point-robot"), "No such command"),
         (("tcmrl-data", "build", "point-robot", "--folder", "x"), "No such option"),
         (("tcmrl-data", "derive"), "Missing argument"),
-        (("tcmrl", "train", "data/demo", "--steps", "many"), "not a valid integer"),
+        (("tcmrl", "train", "data/demo", "--stop-at", "many"), "not a valid integer"),
         (("make", "deom"), "deom"),
         (("python", "benchmarks/absent.py"), "absent"),
     ],

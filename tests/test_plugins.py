@@ -222,7 +222,9 @@ def test_envs_lists_broken_environments_with_their_errors_beside_all_others(
     assert [row["name"] for row in listed["environments"]] == sorted([*ours, "pole/long", "pole/short"])
     code, output, _ = call("envs")
     assert (code, output.count("broken: environment 'rusty' of package")) == (0, 1)
-    assert_refused(call("plan", "rusty"), "environment 'rusty' of package 'users-package' is broken")
+    assert_refused(
+        call("build", "rusty", "--plan"), "environment 'rusty' of package 'users-package' is broken"
+    )
 
 
 def test_an_environment_whose_recipe_does_not_load_is_listed_as_broken(site: Path) -> None:

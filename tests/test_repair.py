@@ -247,9 +247,9 @@ def test_the_command_offers_a_copy_and_takes_it(
 ) -> None:
     folder, run = tiny_copy(), in_process(data, capsys)
     (folder / part_file(PartKey(3, 0))).unlink()
-    code, _, error = run("repair", folder, "--quiet")
+    code, _, error = run("verify", folder, "--repair", "--quiet")
     assert code != 0 and "--from COPY" in error and "--accept" in error
-    code, printed, _ = run("repair", folder, "--from", tiny_folder, "--quiet")
+    code, printed, _ = run("verify", folder, "--repair", "--from", tiny_folder, "--quiet")
     assert code == 0 and f"taken from {tiny_folder}, same digest" in printed
     assert "0 parts regenerated, 1 copied, 0 tables rewritten, 0 findings left" in printed
 
@@ -270,7 +270,7 @@ def test_a_lost_or_damaged_manifest_is_restored_from_its_copy(
         (folder / MANIFEST).unlink()
     else:
         (folder / MANIFEST).write_bytes(damage)
-    with pytest.raises(ManifestError, match=f"`tcmrl-data repair {folder}` restores it"):
+    with pytest.raises(ManifestError, match=f"`tcmrl-data verify {folder} --repair` restores it"):
         open_dataset(folder)
     rot(folder / TASKS)
     assert MANIFEST in found(folder)
@@ -303,7 +303,9 @@ def test_a_build_does_not_take_a_dataset_without_its_manifest_for_a_new_one(tiny
     folder = tiny_copy()
     recipe = read_manifest(folder).recipe
     (folder / MANIFEST).unlink()
-    with pytest.raises(BuildError, match=f"has lost its manifest.json; `tcmrl-data repair {folder}`"):
+    with pytest.raises(
+        BuildError, match=f"has lost its manifest.json; `tcmrl-data verify {folder} --repair`"
+    ):
         tcmrl_data.build_dataset(recipe, folder)
 
 

@@ -147,19 +147,22 @@ def test_a_label_changes_the_digest_and_not_the_root(tmp_path: Path) -> None:
     assert open_dataset(dataset.folder).manifest == manifest
 
 
-def test_the_command_line_splits_and_renames(
+def test_the_command_line_makes_folds_and_splits_episodes(
     graded: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     call = in_process(data, capsys)
     out = tmp_path / "out"
-    code, output, _ = call("split", graded.folder, "--folds", "2", "--views", "--out", out, "--quiet")
+    code, output, _ = call("derive", graded.folder, "--folds", "2", "--view", out, "--quiet")
     assert (code, output.count("35 parts, 7 tasks")) == (0, 2)
     names = ("--episodes", "3,1", "--names", "fit,holdout")
-    code, output, _ = call("split", graded.folder, *names, "--out", out, "--json", "--quiet")
+    code, output, _ = call("derive", graded.folder, *names, "--out", out, "--json", "--quiet")
     assert [Path(row["out"]).name for row in json.loads(output)["datasets"]] == ["fit", "holdout"]
-    assert call("rename", out / "fit", "pr/fit")[0] == 0
-    assert open_dataset(out / "fit").manifest.label == "pr/fit"
-    assert_refused(call("split", graded.folder, "--episodes", "a", "--out", out), "numbers such as 45,5")
-    assert_refused(call("rename", out / "none", "x"), "does not exist")
+    for options, expected in (
+        (("--episodes", "3,a", "--out", out), "numbers such as 45,5"),
+        (("--folds", "2", "--tier", "expert", "--out", out), "--tier does not go with --folds"),
+        (("--folds", "2"), "--out or by --view"),
+        (("--tier", "expert", "--names", "a,b", "--out", out), "--names is for several datasets"),
+    ):
+        assert_refused(call("derive", graded.folder, *options), expected)
     with pytest.raises(StoreError, match="exists"):
         split_dataset(graded, out, folds=3, names=["fit", "b", "c"])

@@ -96,8 +96,8 @@ def test_status_of_a_running_build_from_another_process(tmp_path: Path) -> None:
     options += [word for override in TINY for word in ("--set", override)]
     with command_line("build", "point-robot", *options, directions=directions) as builder:
         directions.wait(builder)
-        with command_line("status", str(out), "--json") as asker:
-            document = json.loads(asker.communicate(timeout=PATIENCE)[0])
+        with command_line("show", str(out), "--json") as asker:
+            document = json.loads(asker.communicate(timeout=PATIENCE)[0])["build"]
         assert document["builder"].startswith(f"process {builder.pid} on ")
         assert document["running"] == ["task 0"]
         assert document["parts_total"] == 6
@@ -117,8 +117,8 @@ def test_of_many_failures_the_latest_are_listed_and_all_counted(
     status = build_status(folder)
     assert (len(status.failed), status.num_failed) == (MAX_MESSAGES, MAX_MESSAGES + 20)
     assert status.failed[-1].startswith(f"task {MAX_MESSAGES + 19} failed")
-    assert run(data, ["status", str(folder)]) == 0
-    assert "120 units; these are the latest 100" in capsys.readouterr().out
+    assert run(data, ["show", str(folder)]) == 0
+    assert "120 units, the latest 100: " in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -253,7 +253,7 @@ def test_train_command_prints_one_json_document(
     monkeypatch.chdir(tmp_path)
     settings = [argument for text in SMALL for argument in ("--set", text)]
     code, output, errors = call(
-        "train", tiny_folder / "manifest.json", "--seed", 2, "--steps", 20, *settings, "--json", "--quiet"
+        "train", tiny_folder / "manifest.json", "--seed", 2, "--stop-at", 20, *settings, "--json", "--quiet"
     )
     document = json.loads(output)
     assert (code, errors) == (0, "")
@@ -261,7 +261,7 @@ def test_train_command_prints_one_json_document(
         "run", "algorithm", "environment", "profile", "seed", "steps", "seconds", "digest"
     }  # fmt: skip
     assert document["run"] == "runs/point-robot-tcmrl-seed2"
-    code, output, errors = call("train", tiny_folder, "--seed", 2, "--steps", 30, "--resume")
+    code, output, errors = call("train", tiny_folder, "--seed", 2, "--stop-at", 30, "--resume")
     assert code == 0
     assert "30 steps" in output
     assert "tcmrl evaluate runs/point-robot-tcmrl-seed2" in errors
@@ -276,7 +276,7 @@ def test_train_command_refuses_bad_input_in_one_line(tiny_folder: Path, tmp_path
     assert_refused(call("train", tiny_folder, "--set", "run.snapshots='steps>=999'", *out), "steps>=999")
     assert_refused(call("train", tiny_folder, "--resume", *out), "no run")
     assert_refused(call("train", tiny_folder, "--resume", "--set", "run.steps=3", *out), "no run")
-    assert_refused(call("train", tiny_folder, "--steps", "0", *out), "--steps")
+    assert_refused(call("train", tiny_folder, "--stop-at", "0", *out), "--stop-at")
     assert_refused(call("train", tiny_folder, "--memory-limit", "much", *out), "much", "2G")
     assert not (tmp_path / "run").exists()
 

@@ -55,8 +55,8 @@ def test_a_method_newer_than_the_dataset_gets_the_installed_recipes_values(older
 
 def test_such_a_run_goes_on_with_the_settings_that_began_it(older: Path, call: Call) -> None:
     arguments = ("train", older, "--algo", "focal", "--set", STEPS, "--out", older.parent / "run")
-    assert call(*arguments, "--steps", "1")[0] == 0
-    code, _, errors = call(*arguments, "--resume", "--steps", "2")
+    assert call(*arguments, "--stop-at", "1")[0] == 0
+    code, _, errors = call(*arguments, "--resume", "--stop-at", "2")
     assert code == 0, errors
 
 

@@ -184,7 +184,7 @@ def resume_run(
     record = run.record.model_copy(update={key: value for key, value in changes.items() if value is not None})
     start = run.checkpoints()[-1].step if run.checkpoints() else 0
     if start > record.steps:
-        raise CheckpointError(f"{out} is at step {start} already, beyond --steps {record.steps}")
+        raise CheckpointError(f"{out} is at step {start} already, beyond --stop-at {record.steps}")
     batches = open_batches(
         dataset,
         record.config.settings.run,

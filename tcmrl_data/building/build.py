@@ -142,7 +142,7 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
     if (out / ASSEMBLY).exists() and not is_dataset:
         raise BuildError(f"{out} holds the beginning of a derived dataset; use another --out")
     if not is_dataset and (out / MANIFEST_COPY).exists():
-        raise BuildError(f"{out} has lost its {MANIFEST}; `tcmrl-data repair {out}` restores it")
+        raise BuildError(f"{out} has lost its {MANIFEST}; `tcmrl-data verify {out} --repair` restores it")
     if not is_dataset:
         return
     manifest = read_manifest(out)

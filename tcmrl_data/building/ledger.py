@@ -311,7 +311,9 @@ class Ledger:
     def _check_size(self, key: PartKey, found: int | None, recorded: int) -> None:
         if found != recorded:
             problem = "is missing" if found is None else f"has {found} bytes instead of {recorded}"
-            raise StoreError(f"{self._out / part_file(key)} {problem}; run `tcmrl-data repair {self._out}`")
+            raise StoreError(
+                f"{self._out / part_file(key)} {problem}; run `tcmrl-data verify {self._out} --repair`"
+            )
 
     def _read(self, key: PartKey) -> Published | None:
         """A part that the tables do not name; None if it is damaged.

@@ -262,9 +262,9 @@ class Dataset:
         try:
             data = read_plain_file(file, limit=entry.size)
         except (OSError, ValueError) as error:
-            raise StoreError(f"{file}: {one_line(error)}; run `tcmrl-data repair`") from None
+            raise StoreError(f"{file}: {one_line(error)}; run `tcmrl-data verify --repair`") from None
         if sha256(data) != entry.sha256:
-            raise StoreError(f"{file} does not have the recorded sha256; run `tcmrl-data repair`")
+            raise StoreError(f"{file} does not have the recorded sha256; run `tcmrl-data verify --repair`")
         return data
 
     def open_part(self, key: PartKey) -> Archive:
@@ -279,7 +279,8 @@ class Dataset:
         if archive.size != entry.size:
             archive.close()
             raise StoreError(
-                f"{archive.path} has {archive.size} bytes instead of {entry.size}; run `tcmrl-data repair`"
+                f"{archive.path} has {archive.size} bytes instead of {entry.size}; "
+                "run `tcmrl-data verify --repair`"
             )
         return archive
 
@@ -320,7 +321,7 @@ class Dataset:
             return unpack(arrays)
         except (StoreError, TrajectoryError) as error:
             file = self.file_of(PartKey(task, step, run))
-            raise StoreError(f"{file}: {error}; run `tcmrl-data repair`") from None
+            raise StoreError(f"{file}: {error}; run `tcmrl-data verify --repair`") from None
 
     def snapshot(self, task: int, step: int, run: str = MAIN_RUN) -> Snapshot:
         """The behavior policy of a part.
@@ -381,7 +382,8 @@ class Dataset:
                 record = read_part_record(archive)
                 if record.id != self.entry(key).id or (record.identity.task, record.identity.step) != key[:2]:
                     raise ManifestError(
-                        f"{archive.path}: is not the part that the manifest names; run `tcmrl-data repair`"
+                        f"{archive.path}: is not the part that the manifest names; "
+                        "run `tcmrl-data verify --repair`"
                     )
                 check_members(archive, record)
                 if len(self._records) >= KEPT_RECORDS:

@@ -12,52 +12,79 @@ from typing import Any
 
 import numpy as np
 
-from tcmrl_data.dataset.dataset import Dataset
+from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.dataset.selection import is_view_file
 from tcmrl_data.envs.base import Split, Task, place_in_order
 from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.foundation.canonical import MAX_JSON_BYTES
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, TcmrlError
-from tcmrl_data.store.manifest import MANIFEST, Manifest, read_manifest
+from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.store.manifest import EPISODES, FOLD, MANIFEST, Derivation
 from tcmrl_data.store.part_table import PartEntry
 from tcmrl_data.store.tables import PARTS
 
 
 def list_datasets(root: str | Path) -> list[dict[str, Any]]:
-    """The datasets below a folder: name, tasks, parts, complete, root, path; unreadable ones with `error`."""
+    """A `dataset_row` for every dataset and view below a folder; `path` and `error` for unreadable ones."""
     rows: list[dict[str, Any]] = []
-    for file in sorted(_manifests(Path(root))):
+    for path in sorted(_paths(Path(root))):
         try:
-            manifest = read_manifest(file)
+            rows.append(dataset_row(open_dataset(path)))
         except ManifestError as error:
-            rows.append({"path": str(file.parent), "error": str(error)})
-            continue
-        rows.append(dataset_row(manifest, file.parent))
+            rows.append({"path": str(path), "error": str(error)})
     return rows
 
 
-def _manifests(root: Path) -> Iterator[Path]:
-    """The manifests below a folder."""
+def _paths(root: Path) -> Iterator[Path]:
+    """The datasets' folders and the files of views below a folder."""
     for folder, inner, files in os.walk(root):
         is_dataset = MANIFEST in files
         if is_dataset:
-            yield Path(folder, MANIFEST)
+            yield Path(folder)
+        else:
+            yield from (Path(folder, name) for name in files if _is_view(Path(folder, name)))
         # in staging are parts on their way, such as those that a repair makes again; archives are many
         inner[:] = [name for name in inner if name != STAGING and not (is_dataset and name == PARTS)]
 
 
-def dataset_row(manifest: Manifest, folder: Path) -> dict[str, Any]:
-    """What a dataset's manifest says in short."""
+def _is_view(file: Path) -> bool:
+    try:
+        return is_view_file(file) and b'"source_root"' in read_plain_file(file, limit=MAX_JSON_BYTES)
+    except (OSError, ValueError):
+        return False
+
+
+def dataset_row(dataset: Dataset) -> dict[str, Any]:
+    """What a dataset's manifest says in short; `source` is the folder that a view reads."""
+    manifest = dataset.manifest
     return {
-        "path": str(folder),
+        "path": str(dataset.path),
+        "label": manifest.label,
         "name": manifest.name,
         "profile": manifest.profile,
         "behavior": manifest.recipe.behavior.source,
         "seed": manifest.seed,
+        "derived": _derived(manifest.derivation),
+        "source": None if dataset.path == dataset.folder else str(dataset.folder),
         "tasks": manifest.num_tasks,
         "parts": manifest.totals.parts,
         "complete": manifest.complete,
         "root": manifest.root,
     }
+
+
+def _derived(derivation: Derivation | None) -> str | None:
+    """How a dataset was derived, so that the folds of one source do not look alike."""
+    if derivation is None:
+        return None
+    settings = derivation.settings
+    if derivation.operation == FOLD:
+        return f"fold {settings['fold']} of {settings['folds']}"
+    if derivation.operation == EPISODES:
+        first, number = settings["first"], settings["number"]
+        return f"episodes {first}-{first + number - 1}"
+    return derivation.operation
 
 
 def dataset_summary(dataset: Dataset) -> dict[str, Any]:
@@ -70,7 +97,7 @@ def dataset_summary(dataset: Dataset) -> dict[str, Any]:
     """
     manifest = dataset.manifest
     platforms = manifest.platforms
-    return dataset_row(manifest, dataset.folder) | {
+    return dataset_row(dataset) | {
         "description": manifest.recipe.about.description,
         "train": len(dataset.train_tasks),
         "test": len(dataset.test_tasks),

@@ -7,8 +7,8 @@ They choose files by name (`data_dir`, `train_epoch` for the step, `n_trj` for t
 take the last row of each for the end of an episode, so that flags, extra arrays and runs have no place.
 
 `tasks.json` beside the folders lists the tasks with their splits and parameters;
-`tcmrl-data import idaq-npy FOLDER --tasks FOLDER/tasks.json` reads them back. Episodes of the published data
-end with the time limit, so every last step is read as truncated, and the import says so.
+`tcmrl-data import idaq-npy FOLDER --task-file FOLDER/tasks.json` reads them back. Episodes of the published
+data end with the time limit, so every last step is read as truncated, and the import says so.
 
 An object array is a pickle, which could run anything. It is read by the standard library's unpickler with an
 allow-list of the names that NumPy's arrays need. The names stand for functions of this module and not for

@@ -279,7 +279,7 @@ class _Source:
                     index = (self.first_task or 0) + position
                 if len(own) > 1:
                     raise StoreError(
-                        f"{path} holds several tasks, which have their numbers; leave --task out"
+                        f"{path} holds several tasks, which have their numbers; leave --first-task out"
                     )
                 yield path, index, part
 
@@ -346,7 +346,7 @@ def _tasks_of_file(file: Path) -> dict[int, Task]:
     try:
         data = read_plain_file(file.resolve(), limit=MAX_JSON_BYTES)
     except (OSError, ValueError) as error:
-        raise TaskError(f"--tasks {file} cannot be read ({one_line(error)})") from None
+        raise TaskError(f"--task-file {file} cannot be read ({one_line(error)})") from None
     return {task.index: task for task in parse_task_file(data, file)}
 
 

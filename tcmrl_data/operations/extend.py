@@ -200,7 +200,7 @@ class _Extension:
             ):
                 raise BuildError(
                     f"{self._dataset.folder} has a run {name} that was made with other settings; "
-                    "choose another --run"
+                    "choose another --as"
                 )
             runs[name] = new
         return list(runs.values())

@@ -12,9 +12,7 @@ from tcmrl_data.operations.assembly import check_out, derivation_of
 from tcmrl_data.operations.derive import Derived, summary, write_view
 from tcmrl_data.operations.planning import Plan, PlannedPart, Progress, carry_out, settle_runs
 from tcmrl_data.parts.own_operations import Cut
-from tcmrl_data.store.manifest import read_manifest
-
-FOLD, EPISODES = "fold", "episodes"
+from tcmrl_data.store.manifest import EPISODES, FOLD, read_manifest
 
 
 def split_dataset(
@@ -60,7 +58,7 @@ def split_dataset(
             "a split is into folds (--folds) or by episodes (--episodes); name one of the two"
         )
     if views and folds is None:
-        raise SelectionError("--views: a view names whole parts; episodes can only be split into datasets")
+        raise SelectionError("--view: a view names whole parts; episodes can only be split into datasets")
     if folds is not None:
         plans = [plan_fold(opened, folds=folds, seed=seed, fold=fold) for fold in range(folds)]
     else:

@@ -240,7 +240,7 @@ def publish(
             pass
         else:
             if wanted is not None and not _is_wanted(record.identity, wanted):
-                raise StoreError(f"{file}: holds another part; delete it or choose another --run")
+                raise StoreError(f"{file}: holds another part; delete it or choose another --as")
             return published
     record, data = make()
     replace_file(file, data, staging=folder / STAGING)

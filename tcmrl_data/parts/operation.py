@@ -105,7 +105,7 @@ class StoredPart:
         try:
             return unpack(arrays)[: self.first]
         except (StoreError, TrajectoryError) as error:
-            raise StoreError(f"{self.place}: {error}; run `tcmrl-data repair`") from None
+            raise StoreError(f"{self.place}: {error}; run `tcmrl-data verify --repair`") from None
 
     def head(self, number: int) -> "StoredPart":
         """The part as if it had its first episodes alone."""

@@ -187,7 +187,9 @@ def read_part(part: PartRows, out: Table, *, check_digests: bool) -> Indices:
         if len(lengths) != part.episodes:
             raise StoreError(f"{len(lengths)} episodes instead of {part.episodes}")
     except StoreError as error:
-        raise StoreError(f"{part.dataset.file_of(part.key)}: {error}; run `tcmrl-data repair`") from None
+        raise StoreError(
+            f"{part.dataset.file_of(part.key)}: {error}; run `tcmrl-data verify --repair`"
+        ) from None
     return lengths
 
 
@@ -212,7 +214,7 @@ def _check_digests(part: PartRows, arrays: Arrays) -> None:
         if found != {"dtype": record.dtype, "shape": list(record.shape), "sha256": record.sha256}:
             raise StoreError(
                 f"{part.dataset.file_of(part.key)}: {name} is not the array that part.json records; "
-                "run `tcmrl-data repair`"
+                "run `tcmrl-data verify --repair`"
             )
 
 

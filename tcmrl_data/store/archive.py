@@ -25,7 +25,7 @@ LARGEST_ARCHIVE = 2**31
 MOST_MEMBERS = 2**15
 LONGEST_NAME = 128
 
-REPAIR = "; run `tcmrl-data repair`"
+REPAIR = "; run `tcmrl-data verify --repair`"
 
 _LOCAL, _CENTRAL, _END = 30, 46, 22
 """Bytes of a member's header and of its entry in the directory, but for its name, and of the end record."""

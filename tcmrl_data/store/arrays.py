@@ -349,7 +349,7 @@ def _read_chunks(archive: Archive, layout: ArrayLayout) -> list[bytes]:
         data = archive.read_unchecked(name, limit=limit)  # decoding compares the chunk's own checksum
         problem = chunk_problem(layout, data)
         if problem:
-            raise StoreError(f"{archive.place(name)} {problem}; run `tcmrl-data repair`")
+            raise StoreError(f"{archive.place(name)} {problem}; run `tcmrl-data verify --repair`")
         chunks.append(data)
     return chunks
 
@@ -369,7 +369,7 @@ def _decode(archive: Archive, layout: ArrayLayout, chunks: Sequence[bytes]) -> n
             _decode_chunk(data, chunk)
         except (ValueError, RuntimeError) as error:
             raise StoreError(
-                f"{archive.place(name)} does not decode ({one_line(error)}); run `tcmrl-data repair`"
+                f"{archive.place(name)} does not decode ({one_line(error)}); run `tcmrl-data verify --repair`"
             ) from None
         if not whole:
             target[...] = chunk[tuple(map(slice, target.shape))]

@@ -94,6 +94,10 @@ class Source(Record):
     root: str = Field(pattern=SHA256)
 
 
+FOLD, EPISODES = "fold", "episodes"
+"""The operations that make several datasets of one."""
+
+
 class Derivation(Record):
     """How a dataset was derived from others.
 
@@ -256,7 +260,9 @@ def read_manifest(path: Path) -> Manifest:
     except ManifestError as error:
         if not (folder / MANIFEST_COPY).exists():
             raise
-        raise ManifestError(f"{error}; `tcmrl-data repair {folder}` restores it from its copy") from None
+        raise ManifestError(
+            f"{error}; `tcmrl-data verify {folder} --repair` restores it from its copy"
+        ) from None
 
 
 def write_manifest(folder: Path, data: bytes) -> None:

@@ -293,13 +293,15 @@ def read_part_record(archive: Archive) -> PartRecord:
         values = parse_json(archive.read(RECORD, limit=PART_RECORD_BYTES))
     except ValueError as error:
         raise ManifestError(
-            f"{place}: not a part record ({one_line(error)}); run `tcmrl-data repair`"
+            f"{place}: not a part record ({one_line(error)}); run `tcmrl-data verify --repair`"
         ) from None
     if _num_arrays(values) > MAX_ARRAYS:  # an error about each would take much memory
         raise ManifestError(f"{place}: identity.arrays names more than {MAX_ARRAYS} arrays")
     record = parse_record(PartRecord, values, place, version=PART_SCHEMA)
     if record.id != digest(values["identity"]):
-        raise ManifestError(f"{place}: id is not the digest of its identity; run `tcmrl-data repair`")
+        raise ManifestError(
+            f"{place}: id is not the digest of its identity; run `tcmrl-data verify --repair`"
+        )
     return record
 
 
@@ -327,7 +329,9 @@ def check_members(archive: Archive, record: PartRecord) -> list[ArrayLayout]:
     )
     odd = _odd_member(archive, layouts, has_policy=record.identity.policy is not None)
     if odd:
-        raise StoreError(f"{archive.place(odd)} does not agree with the arrays; run `tcmrl-data repair`")
+        raise StoreError(
+            f"{archive.place(odd)} does not agree with the arrays; run `tcmrl-data verify --repair`"
+        )
     check_expansion(layouts, archive.size, archive.path)
     return layouts
 

@@ -137,7 +137,7 @@ def read_sealed(file: Path, seal: TableSeal) -> bytes:
     if len(data) != seal.bytes or found != seal.sha256 or data.count(b"\n") != seal.lines:
         raise ManifestError(
             f"{file}: its first {seal.bytes} bytes are not those that the manifest seals; "
-            "run `tcmrl-data repair`"
+            "run `tcmrl-data verify --repair`"
         )
     return data
 
@@ -184,7 +184,7 @@ def read_lines(file: Path, num_bytes: int) -> bytes:
                 data += block
         return bytes(data[: data.rfind(b"\n") + 1])
     except FileNotFoundError:
-        raise ManifestError(f"{file} is missing; run `tcmrl-data repair`") from None
+        raise ManifestError(f"{file} is missing; run `tcmrl-data verify --repair`") from None
     except (OSError, ValueError) as error:
         raise ManifestError(f"{file}: {one_line(error)}") from None
 

@@ -15,7 +15,7 @@ from tcmrl_data.foundation.errors import ManifestError, SelectionError, Snapshot
 from tcmrl_data.foundation.plain_files import one_line
 from tcmrl_data.operations.merge import MERGE, plan_merge
 from tcmrl_data.operations.planning import Plan, PlannedPart
-from tcmrl_data.operations.split import EPISODES, FOLD, plan_episodes, plan_fold
+from tcmrl_data.operations.split import plan_episodes, plan_fold
 from tcmrl_data.operations.subset import Choice, plan_subset
 from tcmrl_data.parts.making import one_thread
 from tcmrl_data.parts.operation import (
@@ -31,7 +31,7 @@ from tcmrl_data.parts.own_operations import SUBSET, operation_of, read_cut
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import DECODED_FLOOR, DECODED_RATIO, pack, read_arrays
-from tcmrl_data.store.manifest import MANIFEST, Derivation, Run
+from tcmrl_data.store.manifest import EPISODES, FOLD, MANIFEST, Derivation, Run
 from tcmrl_data.store.part import PartRecord, read_part_record
 from tcmrl_data.store.part_table import PartTable
 from tcmrl_data.store.tables import TASKS, PartKey, part_file
