@@ -131,8 +131,8 @@ def experiment(
       tcmrl experiment --list
       tcmrl experiment tour --workers 2
       tcmrl experiment window_length --steps 1000 --out results/short
-      tcmrl experiment figure4_half_cheetah_vel --profile paper --build
-      tcmrl experiment table2 --tuned tuning --reuse results/figure4
+      tcmrl experiment negative_rewards --profile paper --build
+      tcmrl experiment table2 --tuned tuning --reuse results/table1
       tcmrl experiment mine.toml --data /disk/datasets --only TCMRL
     """
     from tcmrl_algo import load_experiment, run_experiment

@@ -377,10 +377,18 @@ def test_a_file_like_another_takes_what_it_leaves_out(tiny_folder: Path, tmp_pat
         load_experiment(tmp_path / "fourth.toml")
 
 
-def test_the_same_methods_are_compared_in_every_panel_of_figure_4() -> None:
-    panels = [load_experiment(name) for name in experiment_names() if name.startswith("figure4_")]
-    assert len(panels) == 9
-    assert len({json.dumps(panel.to_json()["methods"]) for panel in panels}) == 1
-    assert {panel.protocols for panel in panels} == {load_experiment("table2").protocols}
+def test_table2_compares_all_methods() -> None:
     own = {name for name, kind in METHODS.working().items() if kind.__module__.startswith("tcmrl_algo.")}
-    assert {method.algorithm for method in panels[0].methods.values()} == own
+    assert {method.algorithm for method in load_experiment("table2").methods.values()} == own
+
+
+def test_a_method_is_run_in_the_environments_that_it_names(tiny_folder: Path, tmp_path: Path) -> None:
+    content = experiments.tables(tiny_folder, seeds=[0])
+    content["environments"]["half-cheetah-vel"] = {}
+    content["methods"]["no context"]["environments"] = ["half-cheetah-vel"]
+    made = read_experiment(content, place="test")
+    jobs = plan_runs(made, data=tiny_folder, out=tmp_path, environments=["point-robot"])
+    assert [job.method for job in jobs] == ["TCMRL"]
+    content["methods"]["no context"]["environments"] = ["hopper"]
+    with pytest.raises(TrainingError, match="'no context' names no environment 'hopper'"):
+        read_experiment(content, place="test")

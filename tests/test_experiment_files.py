@@ -37,5 +37,6 @@ def test_every_shipped_experiment_resolves_on_the_recipes_of_its_environments(na
                 tuned=TUNED if method.algorithm == "tcmrl" else None,
             )
             for label, method in experiment.methods.items()
+            if method.runs_in(environment)
         ]
         assert len({config.model_dump_json() for config in configs}) == len(configs)  # no two are the same
