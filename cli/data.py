@@ -26,6 +26,7 @@ from .inspection import inspect
 from .keeping import cache, delete, verify
 from .looking import dataset_report, diff, render
 from .making import build, import_data, import_policy
+from .new import new
 from .options import DATASET, PATH
 from .sharing import card, export
 
@@ -207,7 +208,7 @@ def _progress(status: "BuildStatus") -> dict[str, str]:
 
 data.fill(
     {
-        "Make": [build, import_data, import_policy],
+        "Make": [build, new, import_data, import_policy],
         "Look": [envs, list_, show, inspect, diff, dataset_report, render],
         "Change": [derive, merge, extend, relabel],
         "Keep": [verify, delete, cache],

@@ -38,6 +38,8 @@ from .envs.controller import DeterministicController as DeterministicController
 from .envs.controller import LaneTransition as LaneTransition
 from .envs.controller import Trajectory as Trajectory
 from .envs.controller import UniformController as UniformController
+from .envs.new_package import new_environment as new_environment
+from .envs.own import check_environment as check_environment
 from .envs.rollout import Recorder as Recorder
 from .envs.rollout import first_observation as first_observation
 from .envs.rollout import hidden_entries as hidden_entries

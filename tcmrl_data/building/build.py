@@ -24,7 +24,8 @@ from tcmrl_data.building.work_files import (
     check_work_files,
 )
 from tcmrl_data.engine.base import BaseEngine, Result, Unit, make_engine
-from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.base import ENVIRONMENTS, Task
+from tcmrl_data.envs.own import check_environment
 from tcmrl_data.foundation.canonical import differences
 from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
@@ -107,6 +108,8 @@ def build_dataset(
     plan = plan_build(recipe, seed=seed, tasks=tasks, dropped=dropped)
     _check_folder(out, recipe, seed)
     plan.check_limits()
+    if ENVIRONMENTS.provider(recipe.environment.name.partition("/")[0]) != "tcmrl":
+        check_environment(plan.environment)  # before hours of training; ours pass the tests
     make_folders(out)
     failed: tuple[str, ...] = ()
     read_only = False

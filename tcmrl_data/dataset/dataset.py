@@ -16,6 +16,7 @@ from tcmrl_data.behavior.snapshot import Snapshot, read_snapshot
 from tcmrl_data.dataset.selection import Selection, ViewFile, chosen_parts, is_view_file, read_view
 from tcmrl_data.envs.base import Environment, Split, Task, draw_tasks
 from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.envs.own import OWN_ENVIRONMENTS
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.errors import (
     ManifestError,
@@ -25,6 +26,7 @@ from tcmrl_data.foundation.errors import (
     TaskError,
     TcmrlError,
     TrajectoryError,
+    UnknownNameError,
 )
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.foundation.records import first_problem
@@ -180,6 +182,9 @@ class Dataset:
         except ValidationError as error:
             place = f"{self.folder / MANIFEST}: recipe.environment"
             raise ManifestError(f"{place}: {first_problem(error)}") from None
+        except UnknownNameError as error:
+            remedy = f"if its class stands in a file of yours, export {OWN_ENVIRONMENTS}=FILE.py:CLASS"
+            raise UnknownNameError(f"{error} Or {remedy}") from None
 
     @property
     def train_tasks(self) -> tuple[Task, ...]:

@@ -5,10 +5,13 @@ Lanes step several episodes together. The names of controllers and trajectories 
 
 import abc
 import importlib.resources
+import inspect
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint
 from importlib.resources.abc import Traversable
 from itertools import pairwise
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, final
 
 import gymnasium
@@ -24,6 +27,7 @@ from tcmrl_data.envs.controller import (
     ObservationView,
     Trajectory,
 )
+from tcmrl_data.envs.own import own_entries
 from tcmrl_data.foundation.errors import RecipeError, RenderingError
 from tcmrl_data.foundation.plugins import Registry, unknown_name
 from tcmrl_data.foundation.records import as_model
@@ -180,6 +184,17 @@ class FigureCamera(Camera):
         return np.asarray(canvas.buffer_rgba())[..., :3].copy()
 
 
+@final
+class RenderedCamera(Camera):
+    """Gymnasium's own pictures of a task whose render mode is `rgb_array`, in the simulator's size."""
+
+    def __init__(self, task: gymnasium.Env[Any, Any]) -> None:
+        self._task = task
+
+    def picture(self, observations: FloatArray) -> Picture:
+        return np.asarray(self._task.render(), dtype=np.uint8)
+
+
 class Environment(abc.ABC):
     """A family of tasks with the same state and action space.
 
@@ -224,8 +239,11 @@ class Environment(abc.ABC):
 
     @classmethod
     def recipe_file(cls, name: str) -> Traversable:
-        """The TOML recipe of the environment `name`; a plug-in of another package overrides this method."""
-        return importlib.resources.files("tcmrl_manifests") / f"{name.partition('/')[0]}.toml"
+        """The TOML recipe of the environment `name`: `<name>.toml` beside the class's module."""
+        file = f"{name.partition('/')[0]}.toml"
+        if cls.__module__.partition(".")[0] == "tcmrl_data":
+            return importlib.resources.files("tcmrl_manifests") / file
+        return Path(inspect.getfile(cls)).with_name(file)
 
     @abc.abstractmethod
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
@@ -270,7 +288,9 @@ class Environment(abc.ABC):
     def camera(
         self, task: gymnasium.Env[Any, Any], parameters: Parameters, *, width: int, height: int
     ) -> Camera | None:
-        """A camera for a task; None if the environment cannot be drawn.
+        """A camera for a task, by default what its `render` returns if it was made with `rgb_array`.
+
+        None if the environment cannot be drawn.
 
         Args:
             task: made by `make` with the full view; it plays an episode while pictures are taken.
@@ -280,7 +300,7 @@ class Environment(abc.ABC):
         Raises:
             RenderingError: this machine cannot draw the task.
         """
-        return None
+        return RenderedCamera(task) if task.render_mode == "rgb_array" else None
 
     def draw_path(
         self, axes: "Axes", parameters: Parameters, observations: FloatArray, *, color: str
@@ -343,6 +363,15 @@ class EnvironmentLanes(Lanes):
 @final
 class EnvironmentRegistry(Registry[Environment]):
     """Environments by name; one plug-in may provide several environments."""
+
+    def names(self) -> list[str]:
+        return sorted({*super().names(), *(entry.name for entry in own_entries())})
+
+    def _entries(self) -> dict[str, list[EntryPoint]]:
+        found = super()._entries()
+        for entry in own_entries():
+            found.setdefault(entry.name, []).append(entry)
+        return found
 
     def get(self, name: str) -> type[Environment]:
         family = super().get(name.partition("/")[0])

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 from pydantic import BaseModel, ConfigDict, Field, SerializerFunctionWrapHandler, model_serializer
 
 from tcmrl_data.envs.base import ENVIRONMENTS
+from tcmrl_data.envs.own import declare_file
 from tcmrl_data.foundation.errors import RecipeError, UnknownNameError
 from tcmrl_data.foundation.records import nearest, validate_table
 from tcmrl_data.recipe import PROFILES, Profile
@@ -212,18 +213,22 @@ def open_recipe(name_or_file: str | Path) -> RecipeDocument:
     """The recipe of an environment, or a recipe file.
 
     Args:
-        name_or_file: an environment, such as `point-robot`, or the path of a file whose name ends in `.toml`.
+        name_or_file: an environment, such as `point-robot`, the path of a file whose name ends in `.toml`,
+            or a class in a file of yours, such as `my_env.py:MyEnv`, whose recipe stands beside it.
 
     Raises:
         UnknownNameError: no such environment.
+        PluginError: the file of yours cannot be imported, or holds no such environment.
         RecipeError: the file does not exist or is not a recipe.
     """
     text = str(name_or_file)
     if text.endswith(SUFFIX):
         return _open_file(Path(text))
+    if ".py:" in text:
+        text = declare_file(text)
     file = ENVIRONMENTS.get(text).recipe_file(text)
     if not file.is_file():
-        raise RecipeError(f"environment {text!r} has no recipe {file.name!r} in manifests/")
+        raise RecipeError(f"environment {text!r} has no recipe; write {file} (`tcmrl-data new` writes one)")
     place = f"recipe of {text!r}"
     content = file.read_text(encoding="utf-8")
     return RecipeDocument(text, place, content, _parse(content, place))
