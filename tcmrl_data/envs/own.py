@@ -15,8 +15,6 @@ from tcmrl_data.foundation.errors import PluginError, SimulationError
 from tcmrl_data.foundation.plugins import one_line_error
 
 if TYPE_CHECKING:
-    import gymnasium
-
     from tcmrl_data.envs.base import Environment
 
 OWN_ENVIRONMENTS = "TCMRL_ENVIRONMENTS"
@@ -120,9 +118,7 @@ def _play(environment: "Environment", parameters: Any, place: str) -> tuple[Floa
         task.close()
 
 
-def _steps(
-    environment: "Environment", task: "gymnasium.Env[Any, Any]", place: str
-) -> tuple[FloatArray, FloatArray]:
+def _steps(environment: "Environment", task: Any, place: str) -> tuple[FloatArray, FloatArray]:
     _check_spaces(environment, task, place)
     draws, horizon = np.random.default_rng(CHECK_SEED), environment.settings.horizon
     observations, rewards = [_checked(environment, task.reset(seed=CHECK_SEED)[0], f"{place}: reset()")], []

@@ -1,8 +1,6 @@
 """Gymnasium's Pendulum-v1, whose gravity, mass and length differ from task to task."""
 
-import importlib.resources
 from importlib.metadata import version
-from importlib.resources.abc import Traversable
 from typing import TYPE_CHECKING, Any, final
 
 import gymnasium
@@ -45,10 +43,6 @@ class Pendulum(Environment):
     observation_dim = 3
     action_dim = 1
     settings: PendulumSettings
-
-    @classmethod
-    def recipe_file(cls, name: str) -> Traversable:
-        return importlib.resources.files("tcmrl_pendulum") / "pendulum.toml"
 
     def draw_parameters(self, num_tasks: int, task_seed: int) -> list[dict[str, Any]]:
         spread = self.settings.spread
