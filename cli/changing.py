@@ -443,7 +443,9 @@ def _print(datasets: "list[Derived]", *, as_json: bool, dry_run: bool) -> None:
         cut = f", {made.cut:,} of them cut" if made.cut else ""
         root = f"; root {made.root[:12]}" if made.root else ""
         would = "would have " if dry_run else ""
+        most = " at most" if dry_run and made.cut else ""
         click.echo(
             f"{printable(str(made.out))}: {would}{made.parts:,} parts{cut}, {made.tasks:,} tasks, {span}, "
-            f"{size(made.bytes)}{root}, derived from {', '.join(source[:12] for source in made.sources)}"
+            f"{size(made.bytes)}{most}{root}, "
+            f"derived from {', '.join(source[:12] for source in made.sources)}"
         )

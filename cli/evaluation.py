@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from .frame import footnotes, make_table, number, output_options, print_json, print_table
+from .frame import footnotes, make_table, number, output_options, print_json, print_table, remark
 from .options import ALL_PROTOCOLS, COUNT, DATASET, FILE, INDEX, PATH, PROTOCOL_OR_ALL
 from .places import RUN_PATH
 from .progress import StageProgress
@@ -147,7 +147,7 @@ def evaluate(
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --plot paths.png
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --repeats 10
     """
-    from tcmrl_algo import evaluate_run
+    from tcmrl_algo import evaluate_run, open_run
 
     if plot is not None and protocol == ALL_PROTOCOLS:
         raise click.UsageError("--plot draws one protocol; name it by --protocol")
@@ -185,6 +185,10 @@ def evaluate(
         *([PRIVILEGED] if results[0].privileged else []),
     ]
     footnotes(*notes)
+    run = open_run(run_folder)
+    step = run.checkpoints()[-1].step
+    if step < run.record.steps:
+        remark(f"This run was interrupted: it has {step:,} of {run.record.steps:,} steps.")
 
 
 def _protocols(progress: StageProgress) -> list[str]:

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tcmrl_data.foundation.errors import TcmrlError
-from tcmrl_data.foundation.machine import size
+from tcmrl_data.foundation.machine import available_cores, size
 from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.recipe import PROFILES, Profile
 
@@ -43,6 +44,10 @@ from .progress import StageProgress, with_progress
 
 if TYPE_CHECKING:
     from tcmrl_data import BuildEvent, BuildPlan, Recipe
+
+
+BUSY_SHARE = 0.25
+"""Other work that keeps a larger share of the cores busy makes a build slower than on an idle machine."""
 
 
 @click.command()
@@ -183,7 +188,8 @@ def build(
     else:
         click.echo(
             f"{report.dataset}: {report.built:,} parts built, {report.present:,} already present, "
-            f"in {duration(report.seconds)}; root {report.root[:12]}"
+            f"in {duration(report.seconds)}"
+            f"{f'; root {report.root[:12]}' if report.built + report.present else ''}"
             f"{'; the folder cannot be written, and no write was needed' if report.read_only else ''}"
         )
     if report.failed:
@@ -225,6 +231,7 @@ def _print_plan(plan: "BuildPlan", *, workers: int | None, as_json: bool) -> Non
 
     if not as_json:
         remark("measuring this machine for a few seconds …")
+    busy, cores = os.getloadavg()[0], available_cores()
     planned = tcmrl_data.forecast_build(plan, workers=workers)
     if as_json:
         print_json(dataclasses.asdict(planned))
@@ -246,6 +253,8 @@ def _print_plan(plan: "BuildPlan", *, workers: int | None, as_json: bool) -> Non
     for name, value in rows.items():
         table.add_row(name, value)
     print_table(table)
+    if busy > BUSY_SHARE * cores:
+        remark(f"This machine is busy: {busy:.1f} processes on {cores} cores; the time is that beside them.")
 
 
 def _print_recipe(name_or_file: str, *, profile: Profile, overrides: tuple[str, ...], as_json: bool) -> None:

@@ -437,6 +437,11 @@ def _print_worth(found: "Worth") -> None:
             "–" if low is None or high is None else f"{low:.1%} to {high:.1%}",
         )
     print_table(table)
+    if any(row.worth is not None and row.worth > 1 for row in found.splits):
+        remark(
+            "A worth above 100%: the best known returns are those of stored policies, and own policies now "
+            "gained more over the best single one than the range from uniform actions to them."
+        )
     columns = ["step", "split", "tasks", "rewarded", "in rewards", "in dynamics"]
     table = make_table("visibility of the task, by snapshot", columns=columns, text=["split"])
     for previous, stage in zip([None, *found.stages], found.stages, strict=False):

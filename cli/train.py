@@ -1,5 +1,6 @@
 """`tcmrl` and `tcmrl train`: meta-train on a dataset."""
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -30,6 +31,7 @@ from .options import (
     TRAINING_SETTINGS,
     ManyNames,
 )
+from .places import RUN_FILE
 from .progress import StageProgress
 from .reports import report, runs
 
@@ -125,6 +127,11 @@ def train(
     limit = parse_bytes(memory_limit) if memory_limit else None
     if resume and not dataset.exists():
         raise click.ClickException(f"{dataset} does not exist; name the present folder of the run's dataset")
+    if (dataset / RUN_FILE).is_file():
+        raise click.ClickException(
+            f"{dataset} is a run, not a dataset; to continue it, run `tcmrl train DATASET --resume --out "
+            f"{shlex.quote(str(dataset))}`"
+        )
     opened = open_dataset(dataset)
     config = _config(opened, algo=algo, profile=profile, overrides=overrides)
     folder = out or Path("runs") / f"{opened.name}-{config.settings.run.algorithm}-seed{seed or 0}"
@@ -268,7 +275,8 @@ def _how_to_continue(folder: Path) -> str:
 
 
 def _show(progress: StageProgress, event: "TrainingProgress") -> None:
-    detail = f"{event.data_share:.0%} waiting for data"
+    losses = [f"{name} {value:.3g}" for name, value in event.metrics.items() if name.startswith("loss/")]
+    detail = ", ".join([*losses[:1], f"{event.data_share:.0%} waiting for data"])
     progress.update("training", done=event.step, total=event.steps, unit="steps", detail=detail)
 
 

@@ -158,6 +158,14 @@ def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
     if manifest.seed != seed:
         raise BuildError(f"{out} was built with seed {manifest.seed}, not {seed}; use another --out")
     old, new = (full_settings(of.unit_settings()) for of in (manifest.recipe, recipe))
+    for name, was, wanted in (
+        ("environment", manifest.name, recipe.environment.name),
+        ("profile", manifest.profile, recipe.profile),
+    ):
+        if was != wanted and old != new:
+            raise BuildError(
+                f"{out} was built with {name} {was}, not {wanted}; name that, or use another --out"
+            )
     for place, there, here in differences(old, new):
         raise BuildError(
             f"{out} was built with other settings: {place} is {there} there and {here} here; "

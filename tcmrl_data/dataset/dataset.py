@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import numpy.typing as npt
@@ -99,6 +99,11 @@ class Dataset:
         self.folder, self.manifest, self.path = folder, manifest, folder if file is None else file
         self._view = view
         self._records: dict[PartKey, PartRecord] = {}
+
+    def __repr__(self) -> str:
+        name, totals = self.manifest.label or self.manifest.name, self.manifest.totals
+        tasks, parts = self.manifest.num_tasks, totals.parts
+        return f"<Dataset {str(self.path)!r}: {name}, {tasks:,} tasks, {parts:,} parts>"
 
     def __reduce__(self) -> tuple[type["Dataset"], tuple[Path, Manifest, Path, ViewFile | None]]:
         """Another process gets manifest and view, and reads tables and parts by itself."""
@@ -319,6 +324,7 @@ class Dataset:
         """The episodes of a part.
 
         Raises:
+            SelectionError: the dataset has no such part.
             StoreError: arrays that do not decode or do not form episodes.
         """
         arrays = self.arrays(task, step, run)
@@ -364,6 +370,8 @@ class Dataset:
             SelectionError: the rule cannot be read, or nothing is left of a task.
             TaskError: an index that the dataset does not hold.
         """
+        if split not in (None, *get_args(Split)):
+            raise SelectionError(f"split {split!r} is unknown; expected 'train' or 'test'")
         if tier is not None and snapshots != "all":
             raise SelectionError(f"snapshots {snapshots!r} and tier {tier!r} exclude each other; name one")
         rule = snapshots if tier is None else f"tier:{tier}"

@@ -71,6 +71,10 @@ def chosen_parts(dataset: "Dataset", task: int, rule: str) -> tuple[PartKey, ...
     return tuple(chosen)
 
 
+MOST_TASKS = 10
+"""Tasks that an error lists."""
+
+
 @dataclass(frozen=True)
 class Selection:
     """Some tasks and snapshots of a dataset; a view, nothing is loaded.
@@ -88,7 +92,14 @@ class Selection:
     rule: str = "all"
 
     def trajectories(self, task: int) -> list[Trajectory]:
-        """All selected episodes of a task, snapshot by snapshot."""
+        """All selected episodes of a task, snapshot by snapshot.
+
+        Raises:
+            SelectionError: the task is not selected.
+        """
+        if task not in self.parts:
+            held = ", ".join(map(str, [*self.parts][:MOST_TASKS]))
+            raise SelectionError(f"{self.dataset.path}: task {task} is not selected; selected are {held}, …")
         return [trajectory for key in self.parts[task] for trajectory in self.dataset.trajectories(*key)]
 
     def parts_from_test(self) -> list[tuple[PartKey, int]]:

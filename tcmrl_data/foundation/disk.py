@@ -271,6 +271,8 @@ def named_errors(path: Path, *, remedy: str = GO_ON) -> Iterator[None]:
         yield
     except OSError as error:
         reason = os.strerror(error.errno) if error.errno else str(error)
+        if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+            remedy = "give yourself the right to write there, or choose another place"
         raise StorageError(f"cannot write {path}: {reason}; {remedy}") from None
 
 

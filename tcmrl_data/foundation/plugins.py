@@ -133,10 +133,17 @@ def one_line_error(error: BaseException) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
+MOST_NAMES = 20
+"""Names that an error lists where none is similar."""
+
+
 def unknown_name(kind: str, name: str, known: Iterable[str]) -> UnknownNameError:
     """An error that contains the unknown name and similar known names."""
     names = sorted(known)
     if not names:
         return UnknownNameError(f"unknown {kind} {name!r}; none is installed, install tcmrl again")
-    nearest = difflib.get_close_matches(name, names, n=3, cutoff=0.4) or names[:8]
-    return UnknownNameError(f"unknown {kind} {name!r}; did you mean {', '.join(nearest)}?")
+    nearest = difflib.get_close_matches(name.lower(), names, n=3, cutoff=0.4)
+    if nearest:
+        return UnknownNameError(f"unknown {kind} {name!r}; did you mean {', '.join(nearest)}?")
+    shown = names if len(names) <= MOST_NAMES else [*names[:MOST_NAMES], "…"]
+    return UnknownNameError(f"unknown {kind} {name!r}; there are {', '.join(shown)}")

@@ -147,7 +147,7 @@ def summary(plan: Plan, out: Path, *, root: str | None, far: dict[str, float] | 
         out=out,
         parts=len(plan.parts),
         cut=plan.num_cut,
-        bytes=plan.bytes,
+        bytes=plan.bytes if root is None or out.is_file() else read_manifest(out).totals.bytes,
         tasks=len(plan.tasks),
         steps=tuple(sorted({part.key.step for part in plan.parts})),
         label=plan.label,

@@ -1,0 +1,173 @@
+"""What users stumbled over in their first hour: messages that name the cause, and numbers that are true."""
+
+import json
+import os
+import shlex
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import click
+import pytest
+from tcmrl_cli import making
+from tcmrl_cli.data import data
+from tcmrl_cli.frame import footnotes
+from tcmrl_cli.train import tcmrl
+
+import tcmrl_data
+from tcmrl_algo import train_run
+from tcmrl_data import BuildReport, Dataset, list_datasets, open_dataset
+from tcmrl_data.foundation.disk import named_errors
+from tcmrl_data.foundation.errors import BuildError, SelectionError, StorageError
+from tests.commands import Call, assert_refused, in_process
+from tests.graded import graded_dataset, graded_recipe
+from tests.small_training import config_of
+from tests.terminal import as_in_terminal
+
+Copy = Callable[[], Path]
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Call:
+    return in_process(data, capsys)
+
+
+@pytest.fixture(scope="module")
+def graded(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    return graded_dataset(tmp_path_factory.mktemp("graded") / "my data", tasks=range(7))
+
+
+def test_next_commands_can_be_copied_where_a_path_has_spaces(graded: Dataset, call: Call) -> None:
+    _, _, errors = call("show", graded.folder)
+    commands = [shlex.split(line.removeprefix("Next: ")) for line in errors.splitlines()]
+    assert [words[-1] for words in commands] == [str(graded.folder)] * 3
+
+
+def test_footnotes_are_as_wide_as_the_terminal() -> None:
+    @click.command()
+    def show() -> None:
+        footnotes("a note of words " * 10, "another")
+
+    lines = as_in_terminal(show, columns=40).errors.splitlines()
+    assert len(lines) > 4 and max(map(len, lines)) <= 40
+    assert lines[-1] == "another"
+
+
+def test_folds_do_not_look_alike_in_a_list_of_datasets(graded: Dataset, call: Call, tmp_path: Path) -> None:
+    call("derive", graded.folder, "--folds", 2, "--view", tmp_path / "folds", "--quiet")
+    call("derive", graded.folder, "--tier", "expert", "--label", "best", "--out", tmp_path / "b", "--quiet")
+    rows = list_datasets(tmp_path)
+    assert [(row["label"], row["derived"]) for row in rows] == [
+        ("best", "subset"),
+        (None, "fold 0 of 2"),
+        (None, "fold 1 of 2"),
+    ]
+    printed = call("list", tmp_path)[1]
+    assert "best, point-robot" in printed and "fold 1 of 2, view of" in printed
+
+
+def test_derived_episodes_have_their_own_size(graded: Dataset, call: Call, tmp_path: Path) -> None:
+    command = ("derive", graded.folder, "--episodes", 1, "--out", tmp_path / "few", "--json", "--quiet")
+    (row,) = json.loads(call(*command)[1])["datasets"]
+    archives = sum(file.stat().st_size for file in (tmp_path / "few").rglob("*.zip"))
+    assert row["bytes"] == archives
+    assert " at most, derived" in call(*command[:4], "--out", tmp_path / "x", "--dry-run")[1]
+
+
+def test_a_report_and_a_plot_refuse_a_folder_that_is_not_there(
+    graded: Dataset, call: Call, tmp_path: Path
+) -> None:
+    page, picture = tmp_path / "nope" / "x.html", tmp_path / "nope" / "x.png"
+    assert_refused(call("report", graded.folder, "--out", page, "--quiet"), "nope", "does not exist")
+    assert_refused(call("inspect", "returns", graded.folder, "--plot", picture), "nope")
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"), [("FOCAL", "focal"), ("Tcmrl", "tcmrl"), ("zzz", "tcmrl, unicorn")]
+)
+def test_a_method_in_capitals_is_recognised_and_all_are_listed(
+    graded: Dataset, capsys: pytest.CaptureFixture[str], name: str, expected: str
+) -> None:
+    call = in_process(tcmrl, capsys)
+    assert_refused(call("train", graded.folder, "--algo", name), f"unknown algorithm {name!r}", expected)
+
+
+def test_training_on_a_run_says_that_it_is_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "run.json").touch()
+    assert_refused(in_process(tcmrl, capsys)("train", tmp_path), "is a run, not a dataset", "--resume")
+
+
+def test_an_interrupted_run_is_evaluated_with_a_remark(
+    tiny: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for steps, folder in ((5, "part"), (None, "whole")):
+        config = config_of(tiny, "run.steps=5", "run.episodes=2", "run.final_episodes=1")
+        train_run(tiny, tmp_path / folder, config=config, profile="quick", steps=steps)
+    file = tmp_path / "part" / "run.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"steps": 9}))
+    call = in_process(tcmrl, capsys)
+    remark = "This run was interrupted: it has 5 of 9 steps."
+    for folder, is_said in (("part", True), ("whole", False)):
+        code, _, errors = call("evaluate", tmp_path / folder, "--protocol", "offline")
+        assert (code, remark in errors) == (0, is_said), errors
+
+
+def test_a_build_that_made_nothing_has_no_root(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    report = BuildReport(
+        tmp_path, built=0, present=0, failed=("no",), seconds=1.0, root="e3b0" * 16, read_only=False
+    )
+    monkeypatch.setattr(tcmrl_data, "build_dataset", lambda *_, **__: report)
+    code, output, _ = call("build", "point-robot", "--out", tmp_path / "d", "--quiet")
+    assert (code, "; root" in output) == (1, False)
+    monkeypatch.setattr(tcmrl_data, "build_dataset", lambda *_, **__: replace(report, built=1))
+    assert "; root e3b0" in call("build", "point-robot", "--out", tmp_path / "d", "--quiet")[1]
+
+
+@pytest.mark.parametrize(
+    ("recipe", "expected"),
+    [
+        (lambda: tcmrl_data.load_recipe("point-robot", profile="paper"), "profile quick, not paper"),
+        (
+            lambda: tcmrl_data.load_recipe("point-robot-wind", profile="quick"),
+            "environment point-robot, not point-robot-wind",
+        ),
+        (lambda: graded_recipe("rollouts.episodes=9"), "rollouts.episodes is"),
+    ],
+)
+def test_another_profile_or_environment_is_named_before_single_values(
+    graded: Dataset, recipe: Callable[[], tcmrl_data.Recipe], expected: str
+) -> None:
+    with pytest.raises(BuildError, match=expected):
+        tcmrl_data.build_dataset(recipe(), graded.folder)
+
+
+def test_a_plan_on_a_busy_machine_says_so(
+    call: Call, monkeypatch: pytest.MonkeyPatch, in_process: None
+) -> None:
+    monkeypatch.setattr("tcmrl_data.building.forecast.UPDATE_SECONDS", 0.1)
+    command = ("build", "ml1/reach", "--plan", "--behavior", "scripted", "--tasks", "0", "--profile", "quick")
+    for load, is_said in ((making.available_cores() * 3.0, True), (0.0, False)):
+        monkeypatch.setattr(os, "getloadavg", lambda load=load: (load, 0.0, 0.0))
+        code, _, errors = call(*command)
+        assert (code, "This machine is busy" in errors) == (0, is_said)
+
+
+@pytest.mark.parametrize(
+    ("number", "expected"),
+    [(13, "give yourself the right"), (30, "give yourself the right"), (28, "make room on the disk")],
+)
+def test_a_refused_write_has_the_remedy_of_its_reason(number: int, expected: str) -> None:
+    with pytest.raises(StorageError, match=expected), named_errors(Path("file")):
+        raise OSError(number, "refused")
+
+
+def test_wrong_tasks_and_splits_are_named_and_a_dataset_says_what_it_is(graded: Dataset) -> None:
+    with pytest.raises(SelectionError, match="task 99 is not selected; selected are 0, 1"):
+        graded.select(snapshots="last").trajectories(99)
+    with pytest.raises(SelectionError, match="split 'tets' is unknown; expected 'train' or 'test'"):
+        graded.select(split="tets")  # type: ignore[arg-type]
+    assert repr(graded) == f"<Dataset '{graded.folder}': point-robot, 7 tasks, 35 parts>"
+    assert repr(open_dataset(graded.folder)) == repr(graded)
