@@ -162,7 +162,9 @@ def show(dataset: Path, as_json: bool) -> None:
     for name, value in rows.items():
         table.add_row(name, printable(value))
     print_table(table)
-    if document["complete"]:
+    if not document["complete"]:
+        remark(f"Next: run the `tcmrl-data build {document['name']}` command of this dataset again")
+    else:
         next_commands(
             ["tcmrl-data", "inspect", "returns", opened.path],
             ["tcmrl-data", "verify", opened.path],

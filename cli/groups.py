@@ -75,5 +75,6 @@ class Commands(click.Group):
             if f"{ctx.command_path} {args[0]}" in GONE:
                 raise click.ClickException(gone(f"{ctx.command_path} {args[0]}"))
             if Path(args[0]).exists():
-                raise click.UsageError(f"Choose a command: `{ctx.command_path} COMMAND {args[0]}`.", ctx)
+                choices = "|".join(self.commands)
+                raise click.UsageError(f"Choose a command: `{ctx.command_path} {choices} {args[0]}`.", ctx)
         return super().resolve_command(ctx, args)

@@ -31,7 +31,7 @@ def call(capsys: pytest.CaptureFixture[str]) -> Call:
 
 
 def test_inspect_without_a_word_says_which_words_there_are(call: Call, tiny: Dataset) -> None:
-    measures = "quality|coverage|transfer|rewards|worth"
+    measures = "quality|coverage|rewards|transfer|worth"
     expected = f"tcmrl-data inspect returns|tasks|snapshots|episodes|{measures} {tiny.folder}"
     assert_refused(call("inspect", tiny.folder), expected)
     assert_refused(call("inspect", "retuns", tiny.folder), "retuns")

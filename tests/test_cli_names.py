@@ -189,5 +189,5 @@ def test_a_dataset_in_place_of_a_command_is_answered_with_the_command_to_choose(
     tiny_folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     call = in_process(data, capsys)
-    assert_refused(call("inspect", tiny_folder), f"`tcmrl-data inspect COMMAND {tiny_folder}`")
-    assert_refused(call(tiny_folder), f"`tcmrl-data COMMAND {tiny_folder}`")
+    assert_refused(call("inspect", tiny_folder), "`tcmrl-data inspect returns|tasks|", f"{tiny_folder}`")
+    assert_refused(call(tiny_folder), "`tcmrl-data build|import|", f"card {tiny_folder}`")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tcmrl_cli import curation
+from tcmrl_cli import options
 from tcmrl_cli.data import data
 
 import tcmrl_data
@@ -45,7 +45,7 @@ def test_a_tier_takes_the_snapshots_that_its_name_calls_for(graded: Dataset, tie
 
 
 def test_the_command_line_knows_all_tiers() -> None:
-    assert curation.TIERS == TIERS
+    assert options.TIERS == TIERS
 
 
 def test_the_best_is_the_oracle_else_the_expert_else_the_best_snapshot(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tcmrl_cli import verification as verification_commands
+from tcmrl_cli import keeping
 from tcmrl_cli.data import data
 
 from tcmrl_data import verify_dataset
@@ -284,7 +284,7 @@ def test_many_findings_are_told_by_their_kinds(
     tiny_copy: Copy, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, run = tiny_copy(), in_process(data, capsys)
-    monkeypatch.setattr(verification_commands, "MOST_LINES", 3)
+    monkeypatch.setattr(keeping, "MOST_LINES", 3)
     first, *others = sorted((folder / "parts").rglob("*.zip"))
     first.write_bytes(first.read_bytes()[:-1])
     for file in others[:9]:
