@@ -280,7 +280,7 @@ def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_do
     (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
     halfway = replace(directions, at="publishing").hold()
     directed = halfway.direct(unit)
-    command = [sys.executable, "-m", directed.worker]
+    command = [sys.executable, "-m", "tcmrl_data.engine.worker", directed.worker]
     with subprocess.Popen(
         command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as worker:
