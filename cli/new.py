@@ -4,14 +4,14 @@ from pathlib import Path
 
 import click
 
-from .frame import output_options, print_json, remark
+from .frame import next_commands, output_options, print_json
 
 
 @click.command()
 @click.argument("name")
 @click.option("--out", type=click.Path(path_type=Path), help="Folder to make; ./NAME by default.")
 @output_options
-def new(name: str, out: Path | None, as_json: bool, quiet: bool) -> None:
+def new(name: str, out: Path | None, as_json: bool) -> None:
     """Write a package with an environment of your own, ready to build.
 
     It holds an environment, its recipe and its tests. Replace the pendulum in it by your tasks.
@@ -33,4 +33,4 @@ def new(name: str, out: Path | None, as_json: bool, quiet: bool) -> None:
         return
     for file in files:
         click.echo(str(file))
-    remark(f"Next: pip install -e {folder}, then tcmrl-data build {name} --profile quick", quiet=quiet)
+    next_commands(("pip", "install", "-e", folder), ("tcmrl-data", "build", name, "--profile", "quick"))
