@@ -357,13 +357,13 @@ class Dataset:
         tier: str | None = None,
         allow_test: bool = False,
     ) -> Selection:
-        """A view of some tasks and snapshots.
+        """Some tasks and snapshots of the dataset; reads the tables alone.
 
         Args:
             tasks: only these indices; one that is named twice counts once.
             snapshots: `all`, `last`, `steps>=N`, `return>=Q`: of each task, the parts whose mean
                 return reaches the quantile Q in [0, 1] of the task's parts; or `tier:NAME`.
-            tier: a quality tier, such as `medium`; the same as the rule `tier:medium`. `tiers.py` names them.
+            tier: a quality tier, such as `medium`; the same as the rule `tier:medium`; `TIERS` lists them.
             allow_test: let training use parts that were made from test tasks.
 
         Raises:

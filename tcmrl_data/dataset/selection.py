@@ -77,7 +77,7 @@ MOST_TASKS = 10
 
 @dataclass(frozen=True)
 class Selection:
-    """Some tasks and snapshots of a dataset; a view, nothing is loaded.
+    """Some tasks and snapshots of a dataset, whose episodes are not read yet.
 
     Attributes:
         parts: task index to the keys of its selected parts.

@@ -88,7 +88,7 @@ def derive_dataset(
         source: a dataset or a view of one.
         out: folder of the new dataset.
         view: file of the new view instead, which names parts and copies nothing.
-        tier: a quality tier, such as `medium`; `dataset/tiers.py` defines them.
+        tier: a quality tier, such as `medium`; `TIERS` lists them.
         snapshots: a rule of `Dataset.select`, instead of a tier.
         tasks: indices.
         split: only tasks of this split.

@@ -184,7 +184,11 @@ def plot_rewards(found: Rewards, file: Path) -> None:
         steps = [stage.step for stage in rows]
         right.plot(steps, [stage.zero for stage in rows], "o-", color=color, label=f"{split}, zero rewards")
         right.plot(
-            steps, [stage.silent for stage in rows], "s--", color=color, label=f"{split}, silent episodes"
+            steps,
+            [stage.silent for stage in rows],
+            "s--",
+            color=color,
+            label=f"{split}, episodes without reward",
         )
     right.set_ylim(-0.03, 1.03)
     label_axes(right, "how often there is no reward", STEPS_LABEL, "share")
