@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 import tcmrl_data
-from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
+from tcmrl_data.behavior.base import GaussianDescription, Snapshot
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.envs.base import Environment, Task

@@ -8,7 +8,7 @@ import numpy as np
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, Trajectory, open_dataset
-from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.behavior.base import Snapshot
 from tcmrl_data.envs.base import DENSE_REWARDS, Task, draw_tasks
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
 from tcmrl_data.parts.making import make_part

@@ -28,7 +28,7 @@ from tcmrl_data import (
     make_environment,
     roll_out,
 )
-from tcmrl_data.behavior.snapshot import GaussianController
+from tcmrl_data.behavior.base import GaussianController
 from tests.commands import in_process
 
 

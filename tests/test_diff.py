@@ -11,7 +11,7 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import Dataset, derive_dataset, diff_datasets, extend_dataset, open_dataset
-from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.behavior.base import Snapshot
 from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly

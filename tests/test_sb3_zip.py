@@ -18,8 +18,9 @@ from tcmrl_cli.data import data
 from tcmrl_cli.frame import run
 
 import tcmrl_data
+from tcmrl_data.behavior.base import read_snapshot
+from tcmrl_data.behavior.sac import snapshot_of_sac
 from tcmrl_data.behavior.sb3_zip import read_sac
-from tcmrl_data.behavior.snapshot import read_snapshot, snapshot_of_sac
 from tcmrl_data.foundation.errors import SnapshotError
 
 Members = dict[str, bytes]

@@ -9,7 +9,8 @@ from safetensors.numpy import load, save
 from stable_baselines3 import SAC
 
 from tcmrl_data import Dataset, load_recipe
-from tcmrl_data.behavior.snapshot import LOG_STD_RANGE, Snapshot, read_snapshot, snapshot_of_sac
+from tcmrl_data.behavior.base import LOG_STD_RANGE, Snapshot, read_snapshot
+from tcmrl_data.behavior.sac import snapshot_of_sac
 from tcmrl_data.foundation.errors import SnapshotError
 from tcmrl_data.foundation.plain_files import read_plain_file
 

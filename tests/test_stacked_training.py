@@ -13,8 +13,7 @@ from stable_baselines3 import SAC
 
 import tcmrl_data
 from tcmrl_data import Recipe, load_recipe, open_dataset
-from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder, checkpoint_name
-from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder, Snapshot, checkpoint_name
 from tcmrl_data.behavior.stacked import StackedSource
 from tcmrl_data.behavior.stacked_training import GroupTraining
 from tcmrl_data.building.ledger import Ledger

@@ -8,7 +8,7 @@ import pytest
 from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, SelectionError, TcmrlError, measure_transfer, measure_worth
-from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
+from tcmrl_data.behavior.base import GaussianDescription, Snapshot
 from tcmrl_data.quality.measured import PartSteps
 from tcmrl_data.quality.transfer import Transfer, TransferTask
 from tcmrl_data.quality.worth import Half, Sample, context_worth, draw_sample, visibility

@@ -14,9 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, TrainingState
-from tcmrl_data.behavior.snapshot import Snapshot, snapshot_of_sac
+from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, Snapshot, TrainingState
 from tcmrl_data.envs.base import Environment, Task
+from tcmrl_data.envs.controller import ObservationView
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 
 if TYPE_CHECKING:
@@ -180,6 +180,22 @@ def make_model(settings: SacSettings, environment: gymnasium.Env[Any, Any], *, s
     )
     model.set_logger(Logger(folder=None, output_formats=[]))
     return model
+
+
+def snapshot_of_sac(model: "SAC", *, step: int, observation: ObservationView) -> Snapshot:
+    """Makes a snapshot of a Stable-Baselines3 SAC's actor."""
+    actor = model.policy.actor
+    layers = [layer for layer in actor.latent_pi if hasattr(layer, "weight")]
+    named = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {
+        "mean": actor.mu,
+        "log_std": actor.log_std,
+    }
+    tensors = {
+        f"{name}.{kind}": getattr(layer, kind).detach().cpu().numpy().copy()
+        for name, layer in named.items()
+        for kind in ("weight", "bias")
+    }
+    return Snapshot.of_network(step, observation, tensors)
 
 
 @final

@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from tcmrl_data.behavior.snapshot import GaussianDescription, Snapshot
+from tcmrl_data.behavior.base import GaussianDescription, Snapshot
 from tcmrl_data.envs.controller import ObservationView
 from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.disk import make_folders, write_tree

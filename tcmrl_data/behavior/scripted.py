@@ -5,8 +5,7 @@ from typing import final
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource
-from tcmrl_data.behavior.snapshot import ScriptedDescription, Snapshot
+from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, ScriptedDescription, Snapshot
 from tcmrl_data.envs.base import Environment, Task
 
 

@@ -11,9 +11,8 @@ from typing import Any, Literal, final
 import numpy as np
 from pydantic import Field
 
-from tcmrl_data.behavior.base import BehaviorContext
+from tcmrl_data.behavior.base import BehaviorContext, Snapshot
 from tcmrl_data.behavior.sac import SacSettings, SacTraining
-from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.envs.base import Environment, Task
 from tcmrl_data.foundation.errors import BuildError
 

@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 from torch.optim import Adam
 
+from tcmrl_data.behavior.base import LOG_STD_RANGE
 from tcmrl_data.behavior.sac import SacSettings
-from tcmrl_data.behavior.snapshot import LOG_STD_RANGE
 
 SQUASH_EPSILON = 1e-6
 """Keeps the logarithm of 1 - tanh(u)^2 finite; the value of Stable-Baselines3."""

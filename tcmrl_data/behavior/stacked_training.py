@@ -13,8 +13,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from tcmrl_data.behavior.base import BehaviorContext, TrainingState
-from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.behavior.base import BehaviorContext, Snapshot, TrainingState
 from tcmrl_data.behavior.stacked import StackedSettings
 from tcmrl_data.behavior.stacked_learner import ReplayBatch, StackedSac
 from tcmrl_data.envs.controller import BoolArray, FloatArray

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, CheckpointFolder
-from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, CheckpointFolder, Snapshot
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.building.unit import PartMaker, UnitSpec
 from tcmrl_data.engine.base import ENGINES, Unit

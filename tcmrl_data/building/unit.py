@@ -11,9 +11,9 @@ from tcmrl_data.behavior.base import (
     BehaviorContext,
     BehaviorSource,
     CheckpointFolder,
+    Snapshot,
     checkpoint_name,
 )
-from tcmrl_data.behavior.snapshot import Snapshot
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.engine.worker import Send
 from tcmrl_data.envs.base import Task

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from tcmrl_data.behavior.snapshot import Snapshot, read_snapshot
+from tcmrl_data.behavior.base import Snapshot, read_snapshot
 from tcmrl_data.dataset.selection import Selection, ViewFile, chosen_parts, is_view_file, read_view
 from tcmrl_data.envs.base import Environment, Split, Task, draw_tasks
 from tcmrl_data.envs.controller import Trajectory

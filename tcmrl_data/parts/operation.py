@@ -16,7 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
-from tcmrl_data.behavior.snapshot import Snapshot, read_snapshot
+from tcmrl_data.behavior.base import Snapshot, read_snapshot
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.base import Environment, Lanes, Task
 from tcmrl_data.envs.controller import Trajectory

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, ValidationError
 
-from tcmrl_data.behavior.snapshot import Snapshot
+from tcmrl_data.behavior.base import Snapshot
 from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.controller import (
     Controller,

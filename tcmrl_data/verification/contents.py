@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from tcmrl_data.behavior.snapshot import GaussianDescription, read_snapshot
+from tcmrl_data.behavior.base import GaussianDescription, read_snapshot
 from tcmrl_data.envs.base import Environment, Split, Task, draw_tasks
 from tcmrl_data.foundation.errors import ManifestError, SnapshotError, StoreError, TcmrlError, TrajectoryError
 from tcmrl_data.foundation.plain_files import file_problem, folder_problem, words_after
