@@ -33,11 +33,11 @@ import torch
 from torch import Tensor
 
 from tcmrl_algo import Algorithm, ContextAlgorithm, RunResult, create_algorithm
-from tcmrl_algo.adaptation.arena import Arena, Context
 from tcmrl_algo.algorithms.borel import BorelLearner, joined_episodes
 from tcmrl_algo.algorithms.csro import CsroLearner
 from tcmrl_algo.algorithms.macaw import MacawLearner
 from tcmrl_algo.algorithms.unicorn import UnicornLearner
+from tcmrl_algo.evaluation.arena import Arena, Context
 from tcmrl_algo.report.contexts import NUM_TASKS, centroid_accuracy
 from tcmrl_algo.report.sources import read_sources
 from tcmrl_algo.training.checkpoint import RunRecord, open_run

@@ -25,7 +25,7 @@ from tcmrl_algo.algorithms.core import optimizer
 from tcmrl_algo.algorithms.core.method import METHODS
 from tcmrl_algo.algorithms.core.problem import Problem, StagePlan
 from tcmrl_algo.algorithms.core.settings import TrainingSettings
-from tcmrl_algo.training.memory import keep_freed_memory
+from tcmrl_algo.training.train import keep_freed_memory
 from tcmrl_data import Batch, Steps
 
 PEAK_SIZE = 1024

@@ -139,7 +139,7 @@ def runs(folder: Path | None, as_json: bool) -> None:
       tcmrl runs
       tcmrl runs results/perspectives --json
     """
-    from tcmrl_algo.training.listing import list_runs
+    from tcmrl_algo.training.checkpoint import list_runs
 
     if folder is not None and not folder.is_dir():
         raise click.ClickException(f"{folder} is not a folder; name a folder that contains runs")

@@ -12,9 +12,8 @@ import pytest
 from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import Controls, dataset_controls
-from tcmrl_algo.adaptation import controls as controls_module
-from tcmrl_algo.adaptation.control_bench import ControlBench
-from tcmrl_algo.adaptation.fixed import best_target, with_numbers
+from tcmrl_algo.evaluation import controls as controls_module
+from tcmrl_algo.evaluation.controls import ControlBench, best_target, with_numbers
 from tcmrl_data import (
     BelievingController,
     CheckpointError,
@@ -79,8 +78,8 @@ def test_the_fixed_snapshot_is_the_training_tasks_last_policy_that_does_best_the
 def test_of_many_candidates_only_the_best_few_are_tried_in_all_tasks(
     tiny: Dataset, found: Controls, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tcmrl_algo.adaptation.control_bench.SCREENING_TASKS", 3)
-    monkeypatch.setattr("tcmrl_algo.adaptation.control_bench.FINALISTS", 3)
+    monkeypatch.setattr("tcmrl_algo.evaluation.controls.SCREENING_TASKS", 3)
+    monkeypatch.setattr("tcmrl_algo.evaluation.controls.FINALISTS", 3)
     bench = ControlBench(tiny, lambda stage, done, total: None)
     screened, _ = bench.fixed_snapshot()
     bench.close()

@@ -13,7 +13,7 @@ from tcmrl_cli.frame import print_table
 from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import PROTOCOLS, Evaluation, TaskResult, evaluate_run, open_run, resolve, train_run
-from tcmrl_algo.adaptation.paths import PathPlot
+from tcmrl_algo.evaluation.evaluate import PathPlot
 from tcmrl_data import (
     CheckpointError,
     Dataset,
@@ -76,7 +76,7 @@ def test_a_protocol_without_a_random_first_stage_is_run_once(trained: Path, prot
 
 
 def test_final_returns_are_told_apart_by_repeat() -> None:
-    from tcmrl_algo.adaptation.evaluate import _finals
+    from tcmrl_algo.evaluation.evaluate import _finals
 
     flags = np.zeros(1, dtype=bool)
     episodes = [
@@ -104,7 +104,7 @@ def test_without_an_oracle_regret_is_null_and_behavior_norms(
 
 
 def test_success_is_the_share_of_final_episodes_that_succeed() -> None:
-    from tcmrl_algo.adaptation.evaluate import _success
+    from tcmrl_algo.evaluation.evaluate import _success
 
     flags = np.zeros(2, dtype=bool)
     plain = Trajectory(np.zeros((3, 1)), np.zeros((2, 1)), np.zeros(2), flags, flags)

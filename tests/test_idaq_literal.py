@@ -8,7 +8,7 @@ import pytest
 from torch import Tensor, tensor
 
 from tcmrl_algo import PROTOCOLS, Adaptation, Arena
-from tcmrl_algo.adaptation.protocols.idaq_literal import farthest
+from tcmrl_algo.evaluation.protocols.idaq import farthest
 from tcmrl_data import Controller, Dataset, Trajectory, UniformController
 from tests.adapters import GoalReader, arena, goal_of
 

@@ -17,8 +17,8 @@ import torch
 
 import tcmrl_algo
 import tcmrl_data
-from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.algorithms.tcmrl import sparsity_loss
+from tcmrl_algo.evaluation.protocols.base import PROTOCOLS
 from tcmrl_data.envs.base import ENVIRONMENTS
 from tests import experiments
 from tests.plugin_packages import install

@@ -12,7 +12,6 @@ from torch.func import functional_call
 from torch.nn import functional
 
 from tcmrl_algo import create_algorithm, open_run, resolve_for, train_run
-from tcmrl_algo.adaptation.arena import Arena
 from tcmrl_algo.algorithms.core.problem import pad_trajectories
 from tcmrl_algo.algorithms.core.settings import ActorCriticSettings
 from tcmrl_algo.algorithms.macaw import (
@@ -26,6 +25,7 @@ from tcmrl_algo.algorithms.macaw import (
     largest_return,
 )
 from tcmrl_algo.algorithms.macaw_networks import WeightPerceptron
+from tcmrl_algo.evaluation.arena import Arena
 from tcmrl_data import Batch, Dataset, UniformController
 from tests.context_learners import gradients
 from tests.made_up import ACTION_DIM, OBSERVATION_DIM, batch_for, problem, settings, trajectory

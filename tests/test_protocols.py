@@ -8,9 +8,9 @@ import pytest
 from torch import Tensor
 
 from tcmrl_algo import PROTOCOLS, Capabilities
-from tcmrl_algo.adaptation.evaluate import contexts_of_others
-from tcmrl_algo.adaptation.protocols.non_prior import num_uniform_steps
 from tcmrl_algo.algorithms.core.problem import TaskParameters
+from tcmrl_algo.evaluation.evaluate import contexts_of_others
+from tcmrl_algo.evaluation.protocols.non_prior import num_uniform_steps
 from tcmrl_data import Controller, Dataset, TrainingError, Trajectory
 from tests.adapters import GOALS, GoalController, GoalReader, GoalSeeker, arena, oracle
 
@@ -146,7 +146,7 @@ def test_lanes_beyond_one_batch_keep_their_order(two_tests: Dataset, monkeypatch
         return [trajectory.undiscounted_return for trajectory in place.adapted(tasks, contexts, episode=0)]
 
     whole = returns()
-    monkeypatch.setattr("tcmrl_algo.adaptation.lane_stage.MOST_LANES", 2)
+    monkeypatch.setattr("tcmrl_algo.evaluation.arena.MOST_LANES", 2)
     assert returns() == pytest.approx(whole)
 
 
@@ -227,7 +227,7 @@ def test_task_parameters_reach_no_method_without_the_capability(
 def test_a_privileged_method_is_given_the_parameters_of_every_lane(
     two_tests: Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("tcmrl_algo.adaptation.lane_stage.MOST_LANES", 2)
+    monkeypatch.setattr("tcmrl_algo.evaluation.arena.MOST_LANES", 2)
     first, second = two_tests.test_tasks
     method, tasks = Watched(), [second, first, first]
     place = arena(two_tests, method, capabilities=Capabilities(privileged=True))

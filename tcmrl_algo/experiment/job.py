@@ -14,8 +14,8 @@ from typing import Any
 
 import torch
 
-from tcmrl_algo.adaptation.evaluate import evaluate_run
 from tcmrl_algo.algorithms.core.settings import EVALUATION_KEYS, LOGGING_KEYS
+from tcmrl_algo.evaluation.evaluate import evaluate_run
 from tcmrl_algo.experiment.plan import completed, with_threads
 from tcmrl_algo.experiment.results import (
     DIVERGED,

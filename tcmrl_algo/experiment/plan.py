@@ -4,8 +4,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
 from tcmrl_algo.algorithms.core.settings import TrainingConfig
+from tcmrl_algo.evaluation.protocols.base import PROTOCOLS
 from tcmrl_algo.experiment.datasets import fold_datasets, open_datasets
 from tcmrl_algo.experiment.results import Job, Tuned, TunedSettings
 from tcmrl_algo.experiment.spec import Experiment, run_id

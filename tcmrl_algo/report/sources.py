@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from tcmrl_algo.adaptation.evaluate import evaluate_run
-from tcmrl_algo.adaptation.protocols.base import PROTOCOLS
+from tcmrl_algo.evaluation.evaluate import evaluate_run
+from tcmrl_algo.evaluation.protocols.base import PROTOCOLS
 from tcmrl_algo.experiment.results import (
     AGAIN,
     RunResult,

@@ -1,10 +1,11 @@
 """Runs on disk: `run.json`, and checkpoints of safetensors and JSON that appear whole or not at all."""
 
 import hashlib
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import safetensors.torch
 from pydantic import BaseModel, ConfigDict, Field
@@ -17,6 +18,9 @@ from tcmrl_data import CheckpointError, Dataset, open_dataset
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import make_folders, publish_folder, remove_abandoned, remove_tree
 from tcmrl_data.foundation.records import read_record, record_bytes, write_record
+
+EVALUATIONS = "evaluations.jsonl"
+"""In the folder of a run: a line of means for every evaluation."""
 
 KEPT = 2
 """Newest checkpoints kept: the last one, and one to fall back on."""
@@ -203,3 +207,42 @@ def tensors_digest(tensors: Mapping[str, Tensor]) -> str:
         total.update(f"{name} {tensor.dtype} {tuple(tensor.shape)}".encode())
         total.update(tensor.numpy().tobytes())
     return total.hexdigest()
+
+
+def list_runs(root: str | Path) -> list[dict[str, Any]]:
+    """The runs below a folder, sorted by path; unreadable ones with `error`.
+
+    Returns:
+        Rows of `path`, `algorithm`, `environment`, `seed`, `step` of the newest checkpoint (0 without one),
+        `steps`, `dataset`, `root` of the dataset, and `evaluation`, the last one or None.
+    """
+    rows: list[dict[str, Any]] = []
+    for file in sorted(Path(root).glob("**/run.json")):
+        try:
+            rows.append(_row(open_run(file.parent)))
+        except CheckpointError as error:
+            rows.append({"path": str(file.parent), "error": str(error)})
+    return rows
+
+
+def _row(run: Run) -> dict[str, Any]:
+    record, checkpoints = run.record, run.checkpoints()
+    return {
+        "path": str(run.folder),
+        "algorithm": record.config.settings.run.algorithm,
+        "environment": record.environment,
+        "seed": record.seed,
+        "step": checkpoints[-1].step if checkpoints else 0,
+        "steps": record.steps,
+        "dataset": record.dataset,
+        "root": record.root,
+        "evaluation": _last_evaluation(run.folder / EVALUATIONS),
+    }
+
+
+def _last_evaluation(file: Path) -> dict[str, Any] | None:
+    """The last whole line of a run's evaluations."""
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    whole = [line for line in lines if line.endswith("}")]
+    found: dict[str, Any] | None = json.loads(whole[-1]) if whole else None
+    return found

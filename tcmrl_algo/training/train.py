@@ -1,27 +1,110 @@
 """Meta-training: a dataset and a resolved configuration in, a run's folder out."""
 
+import contextlib
+import ctypes
 import importlib.metadata
+import json
 import math
 import sys
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import final
 
 import torch
 from torch import Tensor
+from torch.utils.tensorboard import SummaryWriter
 
 from tcmrl_algo.algorithms.core.method import Algorithm
 from tcmrl_algo.algorithms.core.problem import MomentsRecord, TaskParameters, problem_of
 from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_algo.training.batches import StagedBatches, open_batches
-from tcmrl_algo.training.checkpoint import Run, RunRecord, open_run, tensors_digest, write_run
+from tcmrl_algo.training.checkpoint import EVALUATIONS, Run, RunRecord, open_run, tensors_digest, write_run
 from tcmrl_algo.training.config import method_of, stage_plan
-from tcmrl_algo.training.memory import keep_freed_memory
-from tcmrl_algo.training.metrics import MetricsWriter
 from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError
 from tcmrl_data.foundation.errors import DivergenceError
 from tcmrl_data.foundation.process import DeferredInterrupts
+
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+"""Of glibc's malloc.h; other C libraries have no `mallopt`, or ignore these."""
+LARGEST_TENSOR = 1 << 30
+MOST_FREE = (1 << 31) - 1
+
+
+def keep_freed_memory() -> None:
+    """Lets the process keep freed memory for its next tensors, up to its own peak.
+
+    glibc gives large tensors back to the kernel as soon as they are freed; asking for them anew costs one
+    page fault per 4 KiB, which was a tenth of a training step's time at the paper's sizes.
+    """
+    if sys.platform != "linux":
+        return
+    mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+    if mallopt is not None:
+        mallopt(M_MMAP_THRESHOLD, LARGEST_TENSOR)
+        mallopt(M_TRIM_THRESHOLD, MOST_FREE)
+
+
+def log_evaluation(folder: Path, *, step: int, protocol: str, scores: Mapping[str, float | None]) -> None:
+    """Appends mean scores of an evaluation to a run's `evaluations.jsonl`, and to its TensorBoard curves.
+
+    A run that cannot be written to, such as one on a shared disk, is evaluated all the same.
+
+    Args:
+        folder: the run's.
+        step: of the checkpoint that was evaluated.
+        protocol: by which it was adapted.
+        scores: by name; None where there is none.
+    """
+    with contextlib.suppress(OSError):
+        with (folder / EVALUATIONS).open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps({"step": step, "protocol": protocol, **scores}) + "\n")
+        with SummaryWriter(str(folder / "tensorboard"), filename_suffix=f".{protocol}") as board:
+            for name, value in scores.items():
+                if value is not None:
+                    board.add_scalar(f"return/{protocol}/{name}", value, step)
+
+
+@final
+class MetricsWriter:
+    """Appends to `metrics.jsonl` and `tensorboard/` in a run's folder.
+
+    Args:
+        folder: the run's.
+        step: the checkpoint's step that training goes on from; what a killed run logged beyond it is dropped.
+    """
+
+    def __init__(self, folder: Path, *, step: int) -> None:
+        self._file = folder / "metrics.jsonl"
+        self._keep_until(step)
+        self._stream = self._file.open("a", encoding="utf-8")
+        self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
+
+    def write(self, step: int, metrics: Mapping[str, float], *, stage: str) -> None:
+        """Logs the metrics of a step of a stage."""
+        self._stream.write(json.dumps({"step": step, "stage": stage, **metrics}) + "\n")
+        self._stream.flush()
+        for name, value in metrics.items():
+            self._board.add_scalar(name, value, step)
+
+    def __enter__(self) -> "MetricsWriter":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stream.close()
+        self._board.close()
+
+    def _keep_until(self, step: int) -> None:
+        if not self._file.is_file():
+            return
+        lines = self._file.read_text(encoding="utf-8").splitlines()
+        kept = [line for line in lines if line.endswith("}") and json.loads(line)["step"] <= step]
+        self._file.write_text("".join(f"{line}\n" for line in kept), encoding="utf-8")
+
 
 PACKAGES = ("torch", "numpy")
 """Whose versions results depend on."""

@@ -1,25 +1,171 @@
 """Meta-testing: adapts a trained run to the test tasks, and compares its returns with controls."""
 
-from collections.abc import Callable, Iterable, Sequence
+import dataclasses
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
+from typing import Any, Literal, final
 
 import numpy as np
 import torch
 
-from tcmrl_algo.adaptation.arena import Arena, Context, ProgressCallback, ignore_progress
-from tcmrl_algo.adaptation.control_records import Controls
-from tcmrl_algo.adaptation.controls import dataset_controls
-from tcmrl_algo.adaptation.paths import FinalEpisodes, PathPlot
-from tcmrl_algo.adaptation.protocols.base import PROTOCOLS, Adaptation
-from tcmrl_algo.adaptation.results import Evaluation, Reference, TaskResult
 from tcmrl_algo.algorithms.core.settings import RunSettings
+from tcmrl_algo.evaluation.arena import Arena, Context, ProgressCallback, ignore_progress
+from tcmrl_algo.evaluation.controls import Controls, dataset_controls
+from tcmrl_algo.evaluation.protocols.base import PROTOCOLS, Adaptation
 from tcmrl_algo.training.checkpoint import Run, open_run
 from tcmrl_algo.training.config import method_of
-from tcmrl_algo.training.metrics import log_evaluation
-from tcmrl_algo.training.train import create_algorithm
-from tcmrl_data import Dataset, Task, TrainingError, Trajectory
+from tcmrl_algo.training.train import create_algorithm, log_evaluation
+from tcmrl_data import Dataset, Environment, RenderingError, Task, TrainingError, Trajectory
 from tcmrl_data.foundation.seeding import evenly_spread
+
+Reference = Literal["oracle", "behavior", "stored"]
+
+
+@dataclass(frozen=True)
+class TaskResult:
+    """Result of a run on one test task; returns are undiscounted sums of rewards.
+
+    Attributes:
+        task: index of the task.
+        split: `test`.
+        returns: returns of the adaptation episodes, means over the repeats of the protocol.
+        final: mean return of the adapted policy.
+        finals: the same for every repeat; their spread is that of the protocol's own chance.
+        oracle: return of a controller that knows the task, None if the environment has none.
+        random: return of uniform actions, None if it was not measured.
+        behavior: return of the best of the task's own behavior policies, without their noise; None if the
+            dataset holds none.
+        fixed: return of the best policy that acts the same in all tasks, fitted on the training tasks; None
+            if there is neither an oracle nor a stored policy.
+        regret: oracle - final, None without an oracle.
+        normalized: (final - random) / (best - random), with `best` the return of the reference.
+        reference: where `normalized` is 1: the `oracle` or, without one, `behavior`, or without that one
+            too the best policy's `stored` episodes.
+        success: share of successful final episodes, None if the environment does not define success.
+        shuffled: mean return of the same policy with the contexts of other tasks. A policy that adapts
+            within an episode starts with the belief of the other task and updates it by its observations,
+            so the value measures how well it corrects a wrong belief. A privileged policy keeps the
+            parameters of the task itself.
+    """
+
+    task: int
+    split: str
+    returns: list[float]
+    final: float
+    finals: list[float]
+    oracle: float | None
+    random: float | None
+    behavior: float | None
+    fixed: float | None
+    regret: float | None
+    normalized: float | None
+    reference: Reference
+    success: float | None
+    shuffled: float
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Result of a run on all test tasks; means are over tasks, and None if a task has no value.
+
+    Attributes:
+        algorithm, environment, seed, protocol: which evaluation this is.
+        repeats: how many times the protocol was run; 1 unless its first stage is random.
+        tasks: results by test task.
+        adaptation_curve: mean returns of the first, second, … adaptation episode: how many episodes it
+            takes until the policy is adapted. The episodes are those of the protocol; under `paper` the
+            first ones are the method's exploration, uniform actions unless it has one of its own.
+        mean_final, mean_regret, mean_normalized, mean_shuffled, mean_behavior, mean_fixed: means of the
+            tasks' values.
+        privileged: whether the method is a control that observes the task parameters.
+    """
+
+    algorithm: str
+    environment: str
+    seed: int
+    protocol: str
+    repeats: int
+    tasks: list[TaskResult]
+    adaptation_curve: list[float]
+    mean_final: float
+    mean_regret: float | None
+    mean_normalized: float | None
+    mean_shuffled: float
+    mean_behavior: float | None
+    mean_fixed: float | None
+    privileged: bool
+
+    def to_json(self) -> dict[str, Any]:
+        """The JSON document of `tcmrl evaluate --json`."""
+        return dataclasses.asdict(self)
+
+
+PLOT_FORMATS = (".pdf", ".png", ".svg")
+PANEL = 4.0
+"""Width of a panel in inches."""
+
+
+@dataclass(frozen=True)
+class FinalEpisodes:
+    """The final episodes of an evaluation, by index of the test task.
+
+    Attributes:
+        adapted: with the task's own contexts.
+        other: with contexts of other tasks.
+    """
+
+    adapted: Mapping[int, Sequence[Trajectory]]
+    other: Mapping[int, Sequence[Trajectory]]
+
+
+@final
+class PathPlot:
+    """Draws a final episode of every test task, and beside it one under another task's context.
+
+    Args:
+        file: picture to write.
+        dataset: with environment and tasks.
+        settings: of the evaluation, for the titles.
+
+    Raises:
+        RenderingError: the environment's paths cannot be drawn, or the file's ending is not known.
+    """
+
+    def __init__(self, file: Path, dataset: Dataset, settings: RunSettings) -> None:
+        if file.suffix.lower() not in PLOT_FORMATS:
+            raise RenderingError(f"--plot {file}: the name must end in {', '.join(PLOT_FORMATS)}")
+        if type(dataset.environment).draw_path is Environment.draw_path:
+            raise RenderingError(
+                f"--plot {file}: {dataset.environment.name} has no paths in a plane to draw; leave --plot out"
+            )
+        self._file, self._dataset, self._settings = file, dataset, settings
+
+    def __call__(self, episodes: FinalEpisodes) -> None:
+        """Writes the picture."""
+        from matplotlib import colormaps
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+        from matplotlib.colors import to_hex
+        from matplotlib.figure import Figure
+
+        figure = Figure(figsize=(2 * PANEL, 0.62 * PANEL), layout="constrained")
+        FigureCanvasAgg(figure)
+        panels = figure.subplots(1, 2, sharex=True, sharey=True)
+        name = self._settings.algorithm
+        titles = (f"{name}, adapted ({self._settings.protocol})", f"{name}, other tasks' contexts")
+        colors = colormaps["turbo"](np.linspace(0.05, 0.95, len(episodes.adapted)))
+        for axes, title, found in zip(panels, titles, (episodes.adapted, episodes.other), strict=True):
+            for place, (index, trajectories) in enumerate(found.items()):
+                color, parameters = colors[place], self._dataset.task(index).parameters
+                # contexts of several other tasks take turns
+                observations = trajectories[place % len(trajectories)].observations
+                self._dataset.environment.draw_path(axes, parameters, observations, color=to_hex(color))
+            axes.set(title=title, xlabel="x")
+        panels[0].set_ylabel("y")
+        figure.suptitle(f"{self._dataset.name}: paths in {len(episodes.adapted)} test tasks")
+        figure.savefig(self._file, dpi=110)
+
 
 MOST_OTHERS = 3
 """Most other tasks whose contexts are tried on a task; a single one may be very similar or dissimilar."""

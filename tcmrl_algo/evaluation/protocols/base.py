@@ -5,8 +5,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from tcmrl_algo.adaptation.arena import Arena, Context
 from tcmrl_algo.algorithms.core.settings import PROTOCOL_GROUP
+from tcmrl_algo.evaluation.arena import Arena, Context
 from tcmrl_data import Task
 from tcmrl_data.foundation.plugins import Registry
 

@@ -6,8 +6,8 @@ from typing import final
 
 import numpy as np
 
-from tcmrl_algo.adaptation.arena import Arena, FloatArray
-from tcmrl_algo.adaptation.protocols.base import Adaptation, Protocol
+from tcmrl_algo.evaluation.arena import Arena, FloatArray
+from tcmrl_algo.evaluation.protocols.base import Adaptation, Protocol
 from tcmrl_data import Controller, LaneTransition, Task, Trajectory
 
 

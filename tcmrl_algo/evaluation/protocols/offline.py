@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import final
 
-from tcmrl_algo.adaptation.arena import Arena
-from tcmrl_algo.adaptation.protocols.base import Adaptation, Protocol
+from tcmrl_algo.evaluation.arena import Arena
+from tcmrl_algo.evaluation.protocols.base import Adaptation, Protocol
 from tcmrl_data import Task
 
 
