@@ -152,7 +152,7 @@ def _report_lines(report: "VerifyReport") -> Iterator[str]:
     for note in report.notes[:MOST_LINES]:
         yield f"note: {printable(note.file)}: {printable(note.problem)}"
     if len(report.notes) > MOST_LINES:
-        yield f"note: {len(report.notes) - MOST_LINES:,} more files belong to no part"
+        yield f"note: {len(report.notes) - MOST_LINES:,} more notes; --json lists all"
     for replayed in report.replays:
         differences = "; ".join(replayed.platform_differences)
         how = f"within the tolerance for another platform ({differences})" if differences else "bit for bit"

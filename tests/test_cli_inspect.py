@@ -16,7 +16,7 @@ from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, open_dataset
 from tcmrl_data.store.manifest import Totals
-from tcmrl_data.verification.tables import write_tables
+from tcmrl_data.verification.restoring import write_tables
 from tests.commands import Call, assert_refused, in_process
 from tests.conftest import TASKS
 from tests.terminal import as_in_terminal, assert_fits

@@ -17,7 +17,7 @@ from tcmrl_data.store.part import RECORD
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.tables import TASKS as TASKS_TABLE
 from tcmrl_data.store.tables import PartKey, part_file, seal_of
-from tcmrl_data.verification.tables import write_tables
+from tcmrl_data.verification.restoring import write_tables
 from tests.conftest import TASKS
 
 Copy = Callable[[], Path]

@@ -15,7 +15,8 @@ from tcmrl_data.parts.operation import OPERATIONS, Operation, Simulator, Sources
 from tcmrl_data.parts.own_operations import OWN_OPERATIONS, Import, operation_named, operation_of
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.part import read_part_record
-from tcmrl_data.store.tables import PartKey
+from tcmrl_data.store.tables import PartKey, part_file
+from tcmrl_data.verification.description import NO_SOURCE
 from tcmrl_data.verification.replay import replay_part
 
 KINDS = sorted({**OWN_OPERATIONS, **OPERATIONS.working()}.items())
@@ -95,6 +96,13 @@ def test_an_operation_of_another_package_makes_a_dataset(tiny: Dataset, tmp_path
         }
     report = verify_dataset(made.folder, level="deep", replay=2)
     assert (report.findings, report.replays) == ((), ())  # what it was made from is not here
+    assert {(note.file, note.problem) for note in report.notes} == {
+        (part_file(key), NO_SOURCE) for key in made.parts
+    }
+    assert verify_dataset(made.folder, level="deep", strict=True).findings == report.notes
+    report = verify_dataset(made.folder, level="deep", replay=2, sources=[tiny])
+    assert (report.findings, report.notes) == ((), ())
+    assert [replay.problems for replay in report.replays] == [(), ()]
     again = apply_operation(tiny, tmp_path / "again", "last-episode", {"number": 1}, snapshots="last")
     assert again.manifest.root == made.manifest.root
     assert open_dataset(tmp_path / "last").manifest.derivation == again.manifest.derivation

@@ -2,7 +2,7 @@
 
 import contextlib
 import stat
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -36,13 +36,7 @@ from tcmrl_data.verification.repair import REPAIR
 
 @dataclass(frozen=True)
 class Garbage:
-    """One thing to remove.
-
-    Attributes:
-        path: relative to the dataset.
-        reason: why it is not needed.
-        bytes: size of all its files.
-    """
+    """One thing to remove, its path relative to the dataset, and the size of all its files."""
 
     path: str
     reason: str
@@ -64,19 +58,33 @@ def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage
     folder = dataset_folder(path)
     if not any((folder / name).exists() for name in (MANIFEST, LOCK, STAGING)):
         raise BuildError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
+    with _idle(folder, dry_run=dry_run):
+        found = _garbage(folder)
+        if not dry_run:
+            remove_abandoned(folder)
+            for item in found:
+                if item.path.startswith(CHECKPOINTS) or item.path == f"{STAGING}/{REPAIR}":
+                    remove_tree(folder / item.path)
+    return found
+
+
+@contextlib.contextmanager
+def _idle(folder: Path, *, dry_run: bool) -> Iterator[None]:
+    """Holds the lock of a dataset; a dry run, which writes no lock file, looks whether another process does.
+
+    Raises:
+        BuildError: the dataset's work folders are links.
+        LockedError: a process works on the dataset; names it.
+    """
     check_work_files(folder)
+    if not dry_run:
+        with lock_file(folder / LOCK, f"dataset {folder}"):
+            yield
+        return
     holder = lock_holder(folder / LOCK)
     if holder is not None:
         raise LockedError(f"dataset {folder} is being written by {holder}; wait for it or stop it")
-    if dry_run:
-        return _garbage(folder)
-    with lock_file(folder / LOCK, f"dataset {folder}"):
-        found = _garbage(folder)
-        remove_abandoned(folder)
-        for item in found:
-            if item.path.startswith(CHECKPOINTS) or item.path == f"{STAGING}/{REPAIR}":
-                remove_tree(folder / item.path)
-    return found
+    yield
 
 
 def _garbage(folder: Path) -> tuple[Garbage, ...]:
@@ -168,19 +176,10 @@ def delete_dataset(path: str | Path, *, dry_run: bool = False) -> Deletion:
         read_manifest(folder)
     elif not any((folder / name).exists() for name in (PARTS, ASSEMBLY)):
         raise StoreError(f"{folder} holds no dataset; {NO_REMEDY}")
-    check_work_files(folder)
-    holder = lock_holder(folder / LOCK)
-    if holder is not None:
-        raise LockedError(f"dataset {folder} is being written by {holder}; wait for it or stop it")
-    if dry_run:
-        return _deletion(folder, scan_dataset(folder, follow=False))
-    with lock_file(folder / LOCK, f"dataset {folder}"), named_errors(folder):
+    with _idle(folder, dry_run=dry_run), named_errors(folder):
         scan = scan_dataset(folder, follow=False)
-        _remove(folder, scan)
-    return _deletion(folder, scan)
-
-
-def _deletion(folder: Path, scan: Scan) -> Deletion:
+        if not dry_run:
+            _remove(folder, scan)
     own = [status.st_size for file, status in scan.files.items() if _is_own(file, status.st_mode)]
     kept = [file for file, status in scan.files.items() if not _is_own(file, status.st_mode)]
     return Deletion(folder, len(own), sum(own), tuple(sorted([*kept, *scan.problems, *scan.hidden])))

@@ -14,9 +14,10 @@ from pydantic import ValidationError
 from tcmrl_data.behavior.base import GaussianDescription, read_snapshot
 from tcmrl_data.envs.base import Environment, Split, Task, draw_tasks
 from tcmrl_data.foundation.errors import ManifestError, SnapshotError, StoreError, TcmrlError, TrajectoryError
-from tcmrl_data.foundation.plain_files import file_problem, folder_problem, words_after
+from tcmrl_data.foundation.plain_files import file_problem, folder_problem, one_line, words_after
 from tcmrl_data.foundation.records import first_problem
 from tcmrl_data.parts.making import statistics
+from tcmrl_data.parts.own_operations import SUBSET, read_cut
 from tcmrl_data.recipe.recipe import Recipe, same_settings
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import array_digests, read_arrays, unpack
@@ -25,7 +26,6 @@ from tcmrl_data.store.part import POLICY, RECORD, STANDARD_ARRAYS, PartRecord, c
 from tcmrl_data.store.part_table import REFERENCES, STATISTICS, PartEntry
 from tcmrl_data.store.tables import MAX_TASKS, TASKS
 from tcmrl_data.verification.description import Description, VerifyLevel
-from tcmrl_data.verification.replay import origin_problem
 
 MISSING = "is missing"
 
@@ -35,13 +35,7 @@ DERIVED_KINDS = ("extended", "relabelled")
 
 
 class PartChecks:
-    """Checks of the parts of a dataset; threads may share them.
-
-    Args:
-        folder: the dataset.
-        level: the checks to make.
-        description: what the dataset says of itself.
-    """
+    """Checks of the parts of a dataset; threads may share them."""
 
     def __init__(self, folder: Path, level: VerifyLevel, description: Description) -> None:
         self._folder, self._level, self._description = folder, level, description
@@ -136,9 +130,11 @@ def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None
         recipe: what it was built from; None where that is not known.
     """
     environment = None if recipe is None else recipe_environment(recipe)
-    origin = origin_problem(record)
-    if origin is not None:
-        yield RECORD, origin
+    if (record.identity.derived or {}).get("operation") == SUBSET:
+        try:
+            read_cut(record.identity)
+        except ValueError as error:
+            yield RECORD, f"identity.derived {one_line(error)}"
     yield from _policy_problems(archive, record, environment)
     arrays: dict[str, npt.NDArray[Any]] = {}
     for name, recorded in record.identity.arrays.items():
@@ -300,10 +296,10 @@ def _identity_problems(
     """How a part's record differs from what the dataset says of it.
 
     Args:
-        record: the part's record.
-        entry: the part in the table.
-        task: its task.
-        run: its run.
+        record: of the part.
+        entry: its line in the table.
+        task: of the part.
+        run: of the part.
         settings: of the run's recipe; None where the run was not built.
         data_version: of the dataset.
     """

@@ -28,6 +28,7 @@ VerifyLevel = Literal["quick", "digests", "deep"]
 
 NO_PART = "belongs to no part"
 NO_PARTS_FOLDER = "is a folder that no part has"
+NO_SOURCE = "was not made again: the part that it was made from is not here; name its dataset by --source"
 
 LEFT_EVERYWHERE = {"Thumbs.db", "desktop.ini"}
 """Files that a system leaves in any folder, beside those whose names begin with a dot."""
@@ -55,12 +56,14 @@ class Finding:
 
     @property
     def key(self) -> PartKey | None:
-        """The part that a finding is about; None for other files, and for foreign ones."""
-        return None if self.foreign else key_of_file(self.file)
+        """The part that a finding says is damaged; None for other files, and for foreign ones."""
+        return None if self.foreign or self.note else key_of_file(self.file)
 
     @property
     def note(self) -> bool:
-        """Whether it is a file or empty folder of others that lies beside the data or that systems leave."""
+        """Whether nothing is damaged: a part that could not be made again, or files of others."""
+        if self.problem == NO_SOURCE:
+            return True
         name = self.file.rpartition("/")[2]
         is_beside = not self.file.startswith(f"{PARTS}/") or name.startswith(".") or name in LEFT_EVERYWHERE
         return self.foreign and self.problem in (NO_PART, NO_PARTS_FOLDER) and is_beside

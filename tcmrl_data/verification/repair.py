@@ -2,7 +2,6 @@
 
 import contextlib
 import stat
-import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +14,6 @@ from tcmrl_data.foundation.disk import (
     STAGING,
     lock_file,
     make_folders,
-    move_into_place,
     remove_abandoned,
     remove_tree,
     replace_file,
@@ -45,7 +43,7 @@ from tcmrl_data.store.part import Platform, this_platform
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.tables import MAIN_RUN, TASKS, PartKey, part_file
 from tcmrl_data.verification.description import Finding, VerifyLevel
-from tcmrl_data.verification.tables import restore_tables, write_tables
+from tcmrl_data.verification.restoring import restore_tables, write_tables
 from tcmrl_data.verification.verify import find_problems, verify_dataset
 
 REPAIR = "repair"
@@ -85,7 +83,7 @@ def repair_dataset(
     workers: int | None = None,
     copy: str | Path | None = None,
     accept: bool = False,
-    progress: Callable[[BuildEvent], None] = lambda event: None,
+    progress: Callable[[BuildEvent], None] | None = None,
 ) -> RepairReport:
     """Makes the parts that verification rejects again, and only these, by their operations.
 
@@ -122,7 +120,7 @@ def repair_dataset(
             return _Repair(folder, accept=accept, workers=workers, progress=progress).run(level, copy)
     except ReadOnlyError:
         findings = verify_dataset(folder, level=level).findings
-        if any(not finding.foreign for finding in findings):
+        if any(not finding.foreign and not finding.note for finding in findings):
             raise
         return RepairReport(folder, (), (), findings, (), read_only=True, root=read_manifest(folder).root)
 
@@ -136,7 +134,7 @@ class _Repair:
         *,
         accept: bool,
         workers: int | None,
-        progress: Callable[[BuildEvent], None],
+        progress: Callable[[BuildEvent], None] | None,
     ) -> None:
         self._folder, self._accept, self._workers, self._progress = folder, accept, workers, progress
         self._accepted: list[PartKey] = []
@@ -316,14 +314,10 @@ def _clear(folder: Path, file: str) -> None:
         is_folder = stat.S_ISDIR(old.lstat().st_mode)
     except FileNotFoundError:
         return
-    if not is_folder:
+    if is_folder:
+        remove_tree(old)
+    else:
         old.unlink()
-        return
-    staged = folder / STAGING / f"replaced.{uuid.uuid4().hex}"
-    with lock_file(staged.with_name(f"{staged.name}.lock"), "this removal") as lock:
-        move_into_place(old, staged)
-        remove_tree(staged)
-        lock.unlink()
 
 
 def _build_again(
@@ -332,9 +326,9 @@ def _build_again(
     keys: Sequence[PartKey],
     target: Path,
     workers: int | None,
-    progress: Callable[[BuildEvent], None],
+    progress: Callable[[BuildEvent], None] | None,
 ) -> tuple[str, ...]:
-    """Builds the affected tasks of a run in a folder, where their sound parts lie; their groups train along.
+    """Builds the tasks of damaged parts in a folder, where their sound parts lie; their groups train along.
 
     Args:
         dataset: that holds the damaged parts.

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, SnapshotError, StoreError, TcmrlError
 from tcmrl_data.foundation.plain_files import one_line
 from tcmrl_data.operations.merge import MERGE, plan_merge
@@ -27,7 +27,7 @@ from tcmrl_data.parts.operation import (
     WantedPart,
     can_be_made_again,
 )
-from tcmrl_data.parts.own_operations import SUBSET, operation_of, read_cut
+from tcmrl_data.parts.own_operations import SUBSET, operation_of
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import DECODED_FLOOR, DECODED_RATIO, pack, read_arrays
@@ -35,6 +35,7 @@ from tcmrl_data.store.manifest import EPISODES, FOLD, MANIFEST, Derivation, Run
 from tcmrl_data.store.part import PartRecord, read_part_record
 from tcmrl_data.store.part_table import PartTable
 from tcmrl_data.store.tables import TASKS, PartKey, part_file
+from tcmrl_data.verification.description import NO_SOURCE
 
 FIRST_STEPS = 5
 STEP_TOLERANCE = 1e-3
@@ -122,8 +123,8 @@ def derived_problems(
     folder: Path,
     table: PartTable,
     runs: Mapping[str, Run],
+    files: Mapping[str, Path],
     *,
-    bad: Collection[str],
     only: Collection[str],
 ) -> Iterator[tuple[str, str]]:
     """Makes the parts that were made from others again, and yields files and how they differ: forged ones do.
@@ -134,33 +135,29 @@ def derived_problems(
         folder: the dataset.
         table: its parts.
         runs: its runs by name.
-        bad: files of parts that are known not to hold.
+        files: of the parts that others may be made from, by their ids.
         only: files of the parts that are made again.
     """
     chosen = {name for name, run in runs.items() if run.kind != "built" and can_be_made_again(run)}
     if not chosen:
         return
     keys = {entry.id: entry.key for entry in table.entries()}
-    files = files_of_parts(folder, table, bad=bad)
     for entry in table.entries():
         file, recipe = part_file(entry.key), runs[entry.run].recipe if entry.run in chosen else None
-        if recipe is None or file in bad or file not in only:
+        if recipe is None or file not in only:
             continue
         with contextlib.ExitStack() as stack:
             archive = stack.enter_context(Archive(folder / file))
             record = read_part_record(archive)
             replay = replay_part(archive, record, entry.key, recipe, files)
+            if replay is None:
+                yield file, NO_SOURCE
             for problem in replay.problems if replay is not None and replay.exact else ():
                 yield file, f"made again: {problem}"
             for part_id, source in _open_sources(stack, record, files).items():
                 for what in _contradictions(record, source.record):
-                    yield file, f"{what} the part of {keys[part_id]}, which it names as its source"
-
-
-def files_of_parts(folder: Path, table: PartTable, *, bad: Collection[str]) -> dict[str, Path]:
-    """The files of a dataset's sound parts by their ids."""
-    files = {entry.id: part_file(entry.key) for entry in table.entries()}
-    return {part_id: folder / file for part_id, file in files.items() if file not in bad}
+                    named = keys.get(part_id, files[part_id])
+                    yield file, f"{what} the part of {named}, which it names as its source"
 
 
 def _open_sources(
@@ -241,26 +238,16 @@ def _returns(arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float64]:
     return np.diff(sums[arrays["episode_offsets"]])
 
 
-def origin_problem(record: PartRecord) -> str | None:
-    """What is wrong with the record of where a part was cut from."""
-    derived = record.identity.derived
-    if derived is None or derived.get("operation") != SUBSET:
-        return None
-    try:
-        read_cut(record.identity)
-    except ValueError as error:
-        return f"identity.derived {one_line(error)}"
-    return None
-
-
 def derivation_problems(
-    dataset: Dataset, sources: Sequence[str | Path | Dataset]
+    dataset: Dataset, sources: Sequence[Dataset], *, made_again: bool
 ) -> Iterator[tuple[str, str]]:
     """Does a dataset's derivation again, without writing, and yields files and how they differ.
 
     Args:
         dataset: a derived dataset.
         sources: the datasets that it was derived from, in any order.
+        made_again: its parts have been made again from those of the sources, which says enough of operations
+            whose plan cannot be made again.
 
     Raises:
         SelectionError: the dataset was not derived, a source is missing, or the operation cannot be done
@@ -269,11 +256,15 @@ def derivation_problems(
     derivation = dataset.manifest.derivation
     if derivation is None:
         raise SelectionError(f"--source: {dataset.path} was not derived from other datasets")
-    opened = [source if isinstance(source, Dataset) else open_dataset(source) for source in sources]
-    ordered = _in_order(derivation, opened)
+    ordered = _in_order(derivation, sources)
     plan_again = _PLANS.get(derivation.operation)
+    if plan_again is None and not made_again:
+        raise SelectionError(
+            f"--source: {derivation.operation!r} cannot be planned again to compare; add --deep, which makes "
+            "its parts again"
+        )
     if plan_again is None:
-        raise SelectionError(f"--source: {derivation.operation!r} cannot be done again to compare")
+        return
     try:
         plan = plan_again(ordered, derivation.settings)
     except (TcmrlError, KeyError, TypeError, ValueError, IndexError) as error:

@@ -47,7 +47,6 @@ from tcmrl_data.verification.replay import (
     Replay,
     derivation_problems,
     derived_problems,
-    files_of_parts,
     replay_part,
 )
 
@@ -83,7 +82,7 @@ def verify_dataset(
     sample: int | None = None,
     strict: bool = False,
     sources: Sequence[str | Path | Dataset] = (),
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> VerifyReport:
     """Checks every file of a dataset and reports the findings; changes nothing.
 
@@ -94,7 +93,8 @@ def verify_dataset(
         sample: number of parts, spread over the dataset, of which more than name and size is checked; all
             where None.
         strict: files of others beside the data are findings.
-        sources: datasets that a derived dataset was made of; its derivation is done again and compared.
+        sources: datasets that a derived dataset was made of; its derivation is done again and compared, and
+            parts are made again from theirs.
         progress: called with parts done and parts in all.
 
     Raises:
@@ -112,10 +112,11 @@ def verify_dataset(
     folder = dataset_folder(path)
     if not folder.is_dir() or not any((folder / name).exists() for name in (MANIFEST, PARTS)):
         raise ManifestError(f"{folder} holds no dataset; build one with `tcmrl-data build ENV`")
-    run = _Verification(folder, level, is_locked=False, sample=sample)
+    opened = [source if isinstance(source, Dataset) else open_dataset(source) for source in sources]
+    run = _Verification(folder, level, is_locked=False, sample=sample, sources=opened)
     parts = run.check(progress)
     replays = run.replay(replay)
-    run.derive_again(sources)
+    run.derive_again()
     sizes = [status.st_size for status in run.scan.files.values()]
     seconds = time.monotonic() - started
     found = run.sorted_findings()
@@ -127,25 +128,28 @@ def verify_dataset(
 def find_problems(folder: Path, level: VerifyLevel) -> tuple[Finding, ...]:
     """What `verify_dataset` finds; for a caller that holds the dataset's lock."""
     run = _Verification(folder, level, is_locked=True)
-    run.check(lambda done, total: None)
+    run.check()
     return run.sorted_findings()
 
 
 class _Verification:
-    """One run over a dataset.
+    """One run over a dataset; arguments as of `verify_dataset`.
 
     Args:
-        folder: the dataset.
-        level: the checks to make.
         is_locked: this process holds the dataset's lock.
-        sample: number of parts that are opened; all where None.
     """
 
     def __init__(
-        self, folder: Path, level: VerifyLevel, *, is_locked: bool, sample: int | None = None
+        self,
+        folder: Path,
+        level: VerifyLevel,
+        *,
+        is_locked: bool,
+        sample: int | None = None,
+        sources: Sequence[Dataset] = (),
     ) -> None:
         self._folder, self._level, self._is_locked = folder, level, is_locked
-        self._sample = sample
+        self._sample, self._sources = sample, sources
         began_beside_a_build = self._has_writer()
         self._description = Description.of(folder)
         self.findings = [*self._description.findings]
@@ -157,7 +161,7 @@ class _Verification:
         """What was found, each once, ordered by file."""
         return tuple(sorted(set(self.findings), key=lambda found: (found.file, found.problem)))
 
-    def check(self, progress: Callable[[int, int], None]) -> int:
+    def check(self, progress: Callable[[int, int], None] | None = None) -> int:
         """Checks everything but replays; returns the number of parts checked."""
         manifest = self._description.manifest
         entries: dict[str, PartEntry | None] = {
@@ -178,17 +182,20 @@ class _Verification:
         with ThreadPoolExecutor(available_cores()) as pool:
             checked = zip(entries, pool.map(check, entries, entries.values()), strict=True)
             for done, (file, problems) in enumerate(checked):
-                progress(done, len(entries))
+                if progress is not None:
+                    progress(done, len(entries))
                 self.findings += [finding(file, problem) for problem in problems]
-        progress(len(entries), len(entries))
+        if progress is not None:
+            progress(len(entries), len(entries))
         if self._level == "deep" and manifest is not None and manifest.is_drawn:
             splits = manifest.derivation.split_of_tasks() if manifest.derivation else {}
             for problem in task_problems(self._description.tasks, manifest.recipe, splits):
                 self._add(TASKS, problem)
         if self._level == "deep" and manifest is not None:
-            bad = {found.file for found in self.findings}
             table, runs = self._description.table, {run.name: run for run in manifest.runs}
-            for file, problem in derived_problems(self._folder, table, runs, bad=bad, only=opened):
+            files = self._files_of_parts()
+            only = opened - {found.file for found in self.findings}
+            for file, problem in derived_problems(self._folder, table, runs, files, only=only):
                 self._add(file, problem)
         of_copy = copy_problem(self._folder)
         if of_copy and not self._is_written:
@@ -202,7 +209,7 @@ class _Verification:
         bad = {found.file for found in self.findings}
         recipes = {run.name: run.recipe for run in runs if run.recipe and can_be_made_again(run)}
         keys = [key for key in self._description.table if part_file(key) not in bad and key.run in recipes]
-        files = files_of_parts(self._folder, self._description.table, bad=bad) if number else {}
+        files = self._files_of_parts() if number else {}
         replays = []
         for key in evenly_spread(keys, number):
             file = self._folder / part_file(key)
@@ -219,12 +226,27 @@ class _Verification:
                     self._add(part_file(key), f"replay: {problem}")
         return tuple(replays)
 
-    def derive_again(self, sources: Sequence[str | Path | Dataset]) -> None:
-        """Does the derivation again, if sources are given and the tables are sound, and compares."""
+    def derive_again(self) -> None:
+        """Does the derivation again, if sources are given and nothing is damaged, and compares."""
         manifest = self._description.manifest
-        if sources and manifest is not None and not self.findings:
-            for file, problem in derivation_problems(Dataset(self._folder, manifest), sources):
+        if self._sources and manifest is not None and all(found.note for found in self.findings):
+            dataset, made_again = Dataset(self._folder, manifest), self._level == "deep"
+            for file, problem in derivation_problems(dataset, self._sources, made_again=made_again):
                 self._add(file, f"derivation: {problem}")
+
+    def _files_of_parts(self) -> dict[str, Path]:
+        """The files of the sound parts of the dataset and its sources, by their ids."""
+        bad = {found.file for found in self.findings}
+        files = {
+            entry.id: source.file_of(entry.key)
+            for source in self._sources
+            for entry in source.parts.entries()
+        }
+        return files | {
+            entry.id: self._folder / part_file(entry.key)
+            for entry in self._description.table.entries()
+            if part_file(entry.key) not in bad
+        }
 
     def _has_writer(self) -> bool:
         return not self._is_locked and lock_holder(self._folder / LOCK) is not None

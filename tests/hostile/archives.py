@@ -144,6 +144,30 @@ FORGED = {
     "zip64 records": forge(HONEST, middle=ZIP64),
     "zip64 in the end record": forge(HONEST, {"here": 65535, "all": 65535, "start": LARGE}, middle=ZIP64),
     "zip64 sizes": forge([Member(b"a", b"{}", both={"packed": LARGE, "size": LARGE}, extra=ZIP64_EXTRA)]),
+    "zip64 sizes of a pebibyte": forge(
+        [
+            Member(
+                b"a",
+                b"{}",
+                both={"packed": LARGE, "size": LARGE},
+                extra=struct.pack("<2H2Q", 1, 16, *[2**50] * 2),
+            )
+        ]
+    ),
+    "a zip64 offset beyond the file": forge(
+        [Member(b"a", b"{}", central={"offset": LARGE}, extra=struct.pack("<2HQ", 1, 8, 2**63))]
+    ),
+    "a zip64 field without its sizes": forge(
+        [Member(b"a", b"{}", both={"packed": LARGE, "size": LARGE}, extra=struct.pack("<2H", 1, 0))]
+    ),
+    "an extra field that says more than it holds": forge(
+        [Member(b"a", b"{}", extra=struct.pack("<2H", 0x5455, 2**16 - 1))]
+    ),
+    "a zip64 directory of an exbibyte": forge(
+        HONEST,
+        {"here": 65535, "all": 65535, "length": LARGE, "start": LARGE},
+        middle=struct.pack("<4sQ2H2L4Q", b"PK\6\6", 44, 45, 45, 0, 0, 3, 3, 2**60, START) + ZIP64[56:],
+    ),
     "an extra field": forge([Member(b"a", b"{}", extra=ZIP64_EXTRA)]),
     "an extra field in the local header alone": forge(
         [Member(b"a", ZIP64_EXTRA + b"{}", local={"extra_length": len(ZIP64_EXTRA)})]
