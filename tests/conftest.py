@@ -199,6 +199,14 @@ def tiny(tiny_folder: Path) -> Dataset:
     return tcmrl_data.open_dataset(tiny_folder)
 
 
+@pytest.fixture(scope="session")
+def exported_hdf5(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The whole tiny dataset in HDF5, a file for each task."""
+    out = tmp_path_factory.mktemp("exports") / "hdf5"
+    tcmrl_data.export_dataset(tiny, "hdf5", out)
+    return out
+
+
 @pytest.fixture
 def memory() -> Iterator[Path]:
     """A folder in memory if the system has one, because thousands of syncs on a disk are slow."""

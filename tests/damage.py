@@ -1,5 +1,6 @@
 """Damaged and littered datasets."""
 
+import random
 from pathlib import Path
 
 from tcmrl_data import open_dataset, verify_dataset
@@ -13,6 +14,29 @@ def rot(file: Path) -> None:
     data = file.read_bytes()
     middle = len(data) // 2
     file.write_bytes(data[:middle] + bytes([data[middle] ^ 1]) + data[middle + 1 :])
+
+
+def damaged(data: bytes, chance: random.Random) -> bytes | None:
+    """Data with a bit, a run of bytes or the length changed, or no file."""
+    place = chance.randrange(len(data))
+    match chance.randrange(6):
+        case 0:
+            return data[:place]
+        case 1:
+            return data[:place] + bytes(min(512, len(data) - place)) + data[place + 512 :] + b"\1"
+        case 2:
+            return data[:place] + chance.randbytes(1) + data[place:]
+        case 3:
+            return None
+        case _:
+            return data[:place] + bytes([data[place] ^ 1 << chance.randrange(8)]) + data[place + 1 :]
+
+
+def write(file: Path, data: bytes | None) -> None:
+    if data is None:
+        file.unlink(missing_ok=True)
+    else:
+        file.write_bytes(data)
 
 
 def ids_of(folder: Path) -> dict[PartKey, str]:

@@ -15,13 +15,6 @@ from tests.conftest import TASKS
 from tests.strategies import trajectories
 
 
-@pytest.fixture(scope="module")
-def exported(tiny: Dataset, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("exports") / "flat"
-    export_dataset(tiny, "hdf5", out)
-    return out
-
-
 def read_groups(path: Path) -> list[Trajectory]:
     """The episodes of a file, as the documentation reads them."""
     with h5py.File(path) as file:
@@ -90,18 +83,18 @@ class TestEveryFormat:
         assert list(tmp_path.iterdir()) == []
 
 
-def test_hdf5_reads_back_equal(tiny: Dataset, exported: Path) -> None:
+def test_hdf5_reads_back_equal(tiny: Dataset, exported_hdf5: Path) -> None:
     for task in TASKS:
         original = tiny.select(tasks=[task]).trajectories(task)
-        back = read_groups(exported / f"task_{task:05d}.hdf5")
+        back = read_groups(exported_hdf5 / f"task_{task:05d}.hdf5")
         assert len(back) == len(original) == 18
         for left, right in zip(original, back, strict=True):
             assert_equal(left, right)
 
 
-def test_hdf5_flat_arrays_are_the_transitions(tiny: Dataset, exported: Path) -> None:
+def test_hdf5_flat_arrays_are_the_transitions(tiny: Dataset, exported_hdf5: Path) -> None:
     episodes = tiny.select(tasks=[40]).trajectories(40)
-    with h5py.File(exported / "task_00040.hdf5") as file:
+    with h5py.File(exported_hdf5 / "task_00040.hdf5") as file:
         np.testing.assert_array_equal(
             file["observations"][:], np.concatenate([episode.observations[:-1] for episode in episodes])
         )
@@ -122,9 +115,9 @@ def test_hdf5_flat_arrays_are_the_transitions(tiny: Dataset, exported: Path) -> 
         assert file["timeouts"][:].sum() == 18
 
 
-def test_hdf5_says_where_it_comes_from(tiny: Dataset, exported: Path) -> None:
+def test_hdf5_says_where_it_comes_from(tiny: Dataset, exported_hdf5: Path) -> None:
     for task in tiny.tasks:
-        with h5py.File(exported / f"task_{task.index:05d}.hdf5") as file:
+        with h5py.File(exported_hdf5 / f"task_{task.index:05d}.hdf5") as file:
             attributes = dict(file.attrs)
         assert json.loads(attributes["parameters"]) == dict(task.parameters)
         assert (attributes["task"], attributes["split"]) == (task.index, task.split)

@@ -13,6 +13,7 @@ from tcmrl_data.store.manifest import MANIFEST, restore_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.tables import PARTS, TASKS
 from tcmrl_data.verification import repair as repair_module
+from tests.damage import damaged, write
 from tests.hostile.datasets import base, copies_of
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
@@ -38,29 +39,6 @@ def content(folder: Path) -> dict[str, bytes]:
 
 def found(folder: Path) -> set[str]:
     return {finding.file for finding in verify_dataset(folder).findings}
-
-
-def damaged(data: bytes, chance: random.Random) -> bytes | None:
-    """Data with a bit, a run of bytes or the length changed, or no file."""
-    place = chance.randrange(len(data))
-    match chance.randrange(6):
-        case 0:
-            return data[:place]
-        case 1:
-            return data[:place] + bytes(min(512, len(data) - place)) + data[place + 512 :] + b"\1"
-        case 2:
-            return data[:place] + chance.randbytes(1) + data[place:]
-        case 3:
-            return None
-        case _:
-            return data[:place] + bytes([data[place] ^ 1 << chance.randrange(8)]) + data[place + 1 :]
-
-
-def write(file: Path, data: bytes | None) -> None:
-    if data is None:
-        file.unlink(missing_ok=True)
-    else:
-        file.write_bytes(data)
 
 
 @pytest.mark.check
