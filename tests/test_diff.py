@@ -14,7 +14,7 @@ from tcmrl_data import Dataset, derive_dataset, diff_datasets, extend_dataset, o
 from tcmrl_data.behavior.base import Snapshot
 from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
+from tcmrl_data.operations.assembly import PlannedPart, derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.tables import PartKey
@@ -50,7 +50,7 @@ def changed(
         platform=record.platform,
     )
     with open_assembly(out, derivation_of("test", {}, [tiny]), [tiny]) as assembly:
-        assembly.copy([Copied(key, tiny, key) for key in tiny.parts if key != KEY])
+        assembly.copy([PlannedPart(key, tiny, key) for key in tiny.parts if key != KEY])
         assembly.write(KEY, lambda: made)
         manifest = tiny.manifest
         assembly.finish(

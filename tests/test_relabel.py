@@ -27,7 +27,7 @@ from tcmrl_data import (
 from tcmrl_data.envs.controller import PlaybackController
 from tcmrl_data.foundation.errors import BuildError, SelectionError, SimulationError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
-from tcmrl_data.operations.assembly import Copied, derivation_of, open_assembly
+from tcmrl_data.operations.assembly import PlannedPart, derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.tables import PartKey
@@ -161,7 +161,7 @@ def forged(dataset: Dataset, out: Path, change: Callable[[Trajectory], Trajector
             record = dataset.part(*key)
             identity = record.identity
             if identity.derived is None:
-                assembly.copy([Copied(key, dataset, key)])
+                assembly.copy([PlannedPart(key, dataset, key)])
             else:
                 made = make_part(
                     WantedPart(

@@ -1,7 +1,7 @@
-"""Datasets put together from parts, resumably: a new one, or one that gets further parts in its place."""
+"""What a new dataset consists of, and how it is put together from parts, resumably."""
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -24,7 +24,8 @@ from tcmrl_data.foundation.disk import (
 from tcmrl_data.foundation.errors import BuildError, StoreError
 from tcmrl_data.foundation.plain_files import read_plain_file
 from tcmrl_data.foundation.records import sealed, write_ranges
-from tcmrl_data.parts.making import Published, numbered, publish
+from tcmrl_data.parts.making import Published, make_from, numbered, publish
+from tcmrl_data.parts.operation import Operation, StoredPart, can_be_made_again
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.manifest import (
     Derivation,
@@ -49,25 +50,76 @@ from tcmrl_data.store.tables import (
     read_sealed,
 )
 
+Progress = Callable[[int, int], None]
+"""Called with parts done and parts in all."""
+
 
 @dataclass(frozen=True)
-class Copied:
-    """A part of a new dataset that is a part of another one, byte for byte.
+class PlannedPart:
+    """A part of the new dataset.
 
     Attributes:
         key: in the new dataset.
-        source: the other dataset.
-        source_key: in that dataset.
+        source: where it comes from.
+        source_key: in the source.
+        operation: makes the part of the other, without a simulator; None takes the part over as it is.
     """
 
     key: PartKey
     source: Dataset
     source_key: PartKey
+    operation: Operation[Any] | None = None
 
     @property
     def entry(self) -> PartEntry:
-        """The part's line in its source."""
+        """The line of the other part in its table."""
         return self.source.entry(self.source_key)
+
+    def make(self) -> tuple[PartRecord, bytes]:
+        """The record and the archive of a part that is made anew.
+
+        Raises:
+            StoreError: the part of the source is damaged.
+            SelectionError: it has no such array, or no such episode.
+        """
+        assert self.operation is not None
+        source = StoredPart.of(self.source, self.source_key)
+        return make_from(self.operation, source, task=self.source.task(self.source_key.task))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A new dataset before it is made.
+
+    Attributes:
+        name: the environment's name.
+        data_version: of the parts.
+        runs: how the parts were made, the first with a recipe.
+        tasks: with their splits.
+        parts: of the dataset.
+        derivation: how it follows from its sources.
+        sources: the datasets that are read.
+        label: the dataset's own name.
+    """
+
+    name: str
+    data_version: int
+    runs: tuple[Run, ...]
+    tasks: tuple[Task, ...]
+    parts: tuple[PlannedPart, ...]
+    derivation: Derivation
+    sources: tuple[Dataset, ...]
+    label: str | None = None
+
+    @property
+    def num_cut(self) -> int:
+        """Number of parts that are made anew."""
+        return sum(part.operation is not None for part in self.parts)
+
+    @property
+    def bytes(self) -> int:
+        """Size of the archives; of parts that are cut, that of the whole parts."""
+        return sum(part.entry.size for part in self.parts)
 
 
 def derivation_of(
@@ -117,7 +169,7 @@ class Assembly:
 
     Example:
         >>> with open_assembly(out, derivation, [source]) as assembly:  # doctest: +SKIP
-        ...     assembly.copy([Copied(key, source, key) for key in source.parts])
+        ...     assembly.copy([PlannedPart(key, source, key) for key in source.parts])
         ...     assembly.finish(tasks=source.tasks, runs=source.manifest.runs)
     """
 
@@ -127,20 +179,16 @@ class Assembly:
         self._platforms: list[Platform] = []
         self._copied: list[Path] = []
 
-    def holds(self, key: PartKey) -> bool:
-        """Whether a part was published before, by an attempt that was stopped."""
-        return (self._out / part_file(key)).is_file()
-
     def copy(
         self,
-        parts: Sequence[Copied],
+        parts: Sequence[PlannedPart],
         *,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
-        """Copies parts; each is hashed on the way.
+        """Copies whole parts; each is hashed on the way.
 
         Args:
-            parts: the parts.
+            parts: the parts, none with an operation.
             progress: called with parts done and parts in all.
 
         Raises:
@@ -211,7 +259,7 @@ class Assembly:
         (self._out / ASSEMBLY).unlink()
         return manifest
 
-    def _copy(self, part: Copied) -> PartEntry:
+    def _copy(self, part: PlannedPart) -> PartEntry:
         """Copies a part unless it is there; returns its line."""
         target, entry = self._out / part_file(part.key), part.entry
         if not _holds(target, entry):
@@ -316,3 +364,67 @@ def append_parts(dataset: Dataset, *, runs: Sequence[Run], parts: Sequence[Publi
     }
     write_manifest(folder, sealed(fields))
     return read_manifest(folder)
+
+
+def carry_out(plan: Plan, out: Path, progress: Progress | None = None) -> Manifest:
+    """Makes a planned dataset, or finishes one whose making was stopped.
+
+    Raises:
+        StoreError: the folder holds something else, a part of a source is damaged, or a source has changed.
+        StorageError: the operating system refuses an operation.
+        LockedError: another process writes to the folder.
+    """
+    whole = [part for part in plan.parts if part.operation is None]
+    with open_assembly(out, plan.derivation, plan.sources) as assembly:
+        assembly.copy(
+            whole,
+            progress=None if progress is None else lambda done, _: progress(done, len(plan.parts)),
+        )
+        made = 0
+        for part in plan.parts:
+            if part.operation is not None:
+                made += 1
+                assembly.write(part.key, part.make)
+                if progress is not None:
+                    progress(len(whole) + made, len(plan.parts))
+        return assembly.finish(
+            name=plan.name,
+            data_version=plan.data_version,
+            runs=plan.runs,
+            tasks=plan.tasks,
+            label=plan.label,
+        )
+
+
+def settle_runs(
+    runs: Sequence[Run], keys: Collection[PartKey], tasks: Sequence[Task], *, cut: Collection[str] = ()
+) -> tuple[Run, ...]:
+    """The runs of a new dataset, one with a recipe first.
+
+    Runs call for their snapshots only if every task has those of every run.
+
+    Args:
+        runs: of the sources, under the names of the new dataset.
+        keys: of the new dataset's parts.
+        tasks: of the new dataset.
+        cut: names of runs with parts that were made anew.
+    """
+    counts: dict[str, int] = {}
+    planned = {run.name: frozenset(run.steps or ()) for run in runs}
+    for key in keys:
+        counts[key.run] = counts.get(key.run, 0) + (key.step in planned[key.run])
+    kept = [run for run in runs if run.name in counts]
+    if all(run.recipe is None for run in kept):
+        kept.insert(0, next(run for run in runs if run.recipe is not None))
+    has_all = all(
+        run.steps is not None and counts.get(run.name, 0) == len(run.steps) * len(tasks) for run in kept
+    )
+    return tuple(
+        run.model_copy(
+            update={
+                "steps": run.steps if has_all else None,
+                "kind": "subset" if run.name in cut and can_be_made_again(run) else run.kind,
+            }
+        )
+        for run in sorted(kept, key=lambda run: run.recipe is None)
+    )

@@ -12,8 +12,7 @@ from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.disk import LOCK, lock_file, replace_file
 from tcmrl_data.foundation.errors import SelectionError, StoreError, TierError
 from tcmrl_data.foundation.records import hidden_text, sealed, write_ranges
-from tcmrl_data.operations.assembly import check_out
-from tcmrl_data.operations.planning import Plan, Progress, carry_out
+from tcmrl_data.operations.assembly import Plan, Progress, carry_out, check_out
 from tcmrl_data.operations.subset import Choice, plan_subset
 from tcmrl_data.store.manifest import (
     MANIFEST,

@@ -4,27 +4,27 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-from tcmrl_data.building.work_files import check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.foundation.disk import LOCK, lock_file, remove_abandoned
-from tcmrl_data.foundation.errors import BuildError, StoreError
-from tcmrl_data.operations.assembly import Copied, append_parts, derivation_of, open_assembly
-from tcmrl_data.operations.planning import (
+from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.operations.apply import (
+    Pair,
+    add_parts,
     check_parts,
     jobs_of_pairs,
     keys_of_run,
+    make_of_parts,
     nearest_pairs,
+    runs_like,
     runs_of_pairs,
     simulated_run,
 )
-from tcmrl_data.parts.jobs import DeriveSpec, Job, derive_parts
-from tcmrl_data.parts.making import Published
+from tcmrl_data.operations.assembly import derivation_of
+from tcmrl_data.parts.jobs import DeriveSpec
 from tcmrl_data.parts.own_operations import EXTEND, MAX_NOISE
 from tcmrl_data.recipe.recipe import Rollouts
-from tcmrl_data.store.manifest import Run, read_manifest
-from tcmrl_data.store.tables import MAIN_RUN, PartKey
+from tcmrl_data.store.manifest import Run
+from tcmrl_data.store.tables import MAIN_RUN
 
 
 @dataclass(frozen=True)
@@ -103,143 +103,83 @@ def extend_dataset(
         100
     """
     dataset = open_dataset(path)
-    extension = _Extension(dataset, of, episodes, first_episode, noise, cross)
-    jobs = extension.jobs(keys_of_run(dataset, of, tasks, snapshots), run)
-    sources = sorted({job.source for job in jobs})
-    check_parts(dataset, extension.run, sources, policy=True, allow_drift=allow_drift)
-    runs = extension.runs(jobs)
-    new = [job for job in jobs if job.key not in dataset.parts]
-    names = tuple(sorted({job.key.run for job in jobs}))
+    source, recipe, seed = simulated_run(dataset, of)
+    first = recipe.rollouts.episodes if first_episode is None else first_episode
+    _check_numbers(dataset, recipe.rollouts.lanes, episodes, first, noise, cross)
+    recipe = recipe.model_copy(update={"rollouts": Rollouts(episodes=episodes, lanes=recipe.rollouts.lanes)})
+    keys = keys_of_run(dataset, of, tasks, snapshots)
+    acting = sorted({key.task for key in keys})
+    pairs = [(task, task) for task in acting]
+    if cross:
+        pairs = nearest_pairs(dataset.tasks, [task for task in dataset.tasks if task.index in acting], cross)
+    names = runs_of_pairs(pairs, run)
+    jobs = jobs_of_pairs(names, keys)
+    check_parts(dataset, source, sorted({job.source for job in jobs}), policy=True, allow_drift=allow_drift)
+    common = {"first_episode": first, "noise": float(noise)}
+    origin = {"operation": EXTEND, "of": of, **common, "cross": cross}
+    template = Run(name=run, kind="extended", seed=seed, recipe=recipe, origin=origin, steps=None)
+    runs = _with_runs(dataset, template, names)
+    new = tuple(job for job in jobs if job.key not in dataset.parts)
     target = dataset.path if out is None else out
-    counts = (names, len(new), len(jobs) - len(new), episodes)
+    counts = (tuple(sorted(set(names.values()))), len(new), len(jobs) - len(new), episodes)
     if dry_run or (out is None and not new):
         return ExtendReport(target, *counts, None if dry_run else dataset.manifest.root)
-    spec = extension.spec(target, new)
-
-    def remake() -> list[Published]:
-        return derive_parts(spec, workers=workers, progress=progress)
-
+    spec = DeriveSpec(dataset.path, target, EXTEND, common, recipe, seed, new)
     if out is None:
-        root = _in_place(dataset, runs, remake)
+        manifest = add_parts(dataset, spec, runs=runs, workers=workers, progress=progress)
     else:
-        settings = {
-            **extension.settings,
+        recorded = {
+            **origin,
             "run": run,
             "snapshots": snapshots,
             "tasks": tasks if tasks is None else sorted(set(tasks)),
         }
-        root = _elsewhere(dataset, out, settings, runs, remake)
-    return ExtendReport(target, *counts, root)
-
-
-class _Extension:
-    """The settings of an extension, checked against its dataset."""
-
-    def __init__(
-        self, dataset: Dataset, of: str, episodes: int, first_episode: int | None, noise: float, cross: int
-    ) -> None:
-        run, recipe, seed = simulated_run(dataset, of)
-        lanes = recipe.rollouts.lanes
-        first = recipe.rollouts.episodes if first_episode is None else first_episode
-        for name, value, least in (("--episodes", episodes, 1), ("--first-episode", first, 0)):
-            if value < least or value % lanes:
-                raise BuildError(
-                    f"{name} {value} is no multiple of the {lanes} lanes that the policies of "
-                    f"{dataset.folder} act in together; choose one"
-                )
-        if not (math.isfinite(noise) and 0 <= noise <= MAX_NOISE):
-            raise BuildError(f"--noise {noise} is not in [0, {MAX_NOISE:g}]")
-        if cross < 0:
-            raise BuildError(f"--cross {cross} is negative; choose a number of tasks")
-        self._dataset, self.run, self._seed = dataset, run, seed
-        self._recipe = recipe.model_copy(update={"rollouts": Rollouts(episodes=episodes, lanes=lanes)})
-        self.settings: Mapping[str, Any] = {
-            "operation": EXTEND,
-            "of": of,
-            "first_episode": first,
-            "noise": float(noise),
-            "cross": cross,
-        }
-
-    def jobs(self, keys: Sequence[PartKey], name: str) -> list[Job]:
-        """The parts to make of policies."""
-        sources = sorted({key.task for key in keys})
-        cross = self.settings["cross"]
-        pairs = [(task, task) for task in sources]
-        if cross:
-            tasks = self._dataset.tasks
-            pairs = nearest_pairs(tasks, [task for task in tasks if task.index in {*sources}], cross)
-        return jobs_of_pairs(runs_of_pairs(pairs, name), keys)
-
-    def runs(self, jobs: Sequence[Job]) -> list[Run]:
-        """The runs of the dataset with the new ones.
-
-        Raises:
-            BuildError: a run of the same name was made in another way.
-        """
-        runs = {run.name: run for run in self._dataset.manifest.runs}
-        for name in sorted({job.key.run for job in jobs}):
-            made = {job.key.task: job.source.task for job in jobs if job.key.run == name}
-            old = runs.get(name)
-            held = {key.task for key in self._dataset.parts if key.run == name}
-            sources = dict(old.sources if old else ()) | {
-                task: source for task, source in made.items() if task != source
-            }
-            new = Run(
-                name=name,
-                kind="extended",
-                seed=self._seed,
-                recipe=self._recipe,
-                origin=dict(self.settings),
-                steps=None,
-                sources=tuple(sorted(sources.items())),
-            )
-            if old is not None and (
-                old.model_copy(update={"sources": new.sources}) != new
-                or any(old.source_of(task) != source for task, source in made.items() if task in held)
-            ):
-                raise BuildError(
-                    f"{self._dataset.folder} has a run {name} that was made with other settings; "
-                    "choose another --as"
-                )
-            runs[name] = new
-        return list(runs.values())
-
-    def spec(self, out: Path, jobs: Sequence[Job]) -> DeriveSpec:
-        """What the workers are told."""
-        settings = {name: self.settings[name] for name in ("first_episode", "noise")}
-        source = self._dataset.path.resolve()
-        return DeriveSpec(source, out.resolve(), EXTEND, settings, self._recipe, self._seed, tuple(jobs))
-
-
-def _in_place(dataset: Dataset, runs: Sequence[Run], remake: Callable[[], list[Published]]) -> str:
-    """Adds new parts to the dataset; returns its root."""
-    folder = dataset.folder
-    if dataset.path != folder:
-        raise StoreError(
-            f"{dataset.path} is a view, to which no parts can be added; name a new dataset by --out"
+        manifest = make_of_parts(
+            dataset,
+            out,
+            spec,
+            derivation=derivation_of(EXTEND, recorded, [dataset]),
+            runs=runs,
+            with_old=True,
+            workers=workers,
+            progress=progress,
         )
-    check_work_files(folder)
-    with lock_file(folder / LOCK, f"dataset {folder}"):
-        remove_abandoned(folder)
-        if read_manifest(folder).digest != dataset.manifest.digest:
-            raise StoreError(f"{folder} has changed meanwhile; run the same command again")
-        return append_parts(dataset, runs=runs, parts=remake()).root
+    return ExtendReport(target, *counts, manifest.root)
 
 
-def _elsewhere(
-    dataset: Dataset,
-    out: Path,
-    settings: Mapping[str, Any],
-    runs: Sequence[Run],
-    remake: Callable[[], list[Published]],
-) -> str:
-    """Makes a new dataset of the old and the new parts; returns its root."""
-    manifest = dataset.manifest
-    with open_assembly(out, derivation_of(EXTEND, settings, [dataset]), [dataset]) as assembly:
-        assembly.copy([Copied(key, dataset, key) for key in dataset.parts])
-        for published in remake():
-            assembly.take(published)
-        return assembly.finish(
-            name=manifest.name, data_version=manifest.data_version, runs=runs, tasks=dataset.tasks
-        ).root
+def _check_numbers(dataset: Dataset, lanes: int, episodes: int, first: int, noise: float, cross: int) -> None:
+    for name, value, least in (("--episodes", episodes, 1), ("--first-episode", first, 0)):
+        if value < least or value % lanes:
+            raise BuildError(
+                f"{name} {value} is no multiple of the {lanes} lanes that the policies of "
+                f"{dataset.folder} act in together; choose one"
+            )
+    if not (math.isfinite(noise) and 0 <= noise <= MAX_NOISE):
+        raise BuildError(f"--noise {noise} is not in [0, {MAX_NOISE:g}]")
+    if cross < 0:
+        raise BuildError(f"--cross {cross} is negative; choose a number of tasks")
+
+
+def _with_runs(dataset: Dataset, template: Run, names: Mapping[Pair, str]) -> list[Run]:
+    """The runs of the dataset with those of new parts.
+
+    Raises:
+        BuildError: a run of the same name was made in another way.
+    """
+    runs = {run.name: run for run in dataset.manifest.runs}
+    for new in runs_like(template, names):
+        old = runs.get(new.name)
+        made = {to: task for (task, to), name in names.items() if name == new.name}
+        held = {key.task for key in dataset.parts if key.run == new.name}
+        known = dict(old.sources if old else ())
+        merged = new.model_copy(update={"sources": tuple(sorted((known | dict(new.sources)).items()))})
+        if old is not None and (
+            old.model_copy(update={"sources": merged.sources}) != merged
+            or any(old.source_of(to) != made[to] for to in made.keys() & held)
+        ):
+            raise BuildError(
+                f"{dataset.folder} has a run {new.name} that was made with other settings; "
+                "choose another --as"
+            )
+        runs[new.name] = merged
+    return list(runs.values())

@@ -10,9 +10,16 @@ from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.foundation.canonical import canonical_json, differences, digest
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.operations.assembly import check_out, derivation_of
+from tcmrl_data.operations.assembly import (
+    Plan,
+    PlannedPart,
+    Progress,
+    carry_out,
+    check_out,
+    derivation_of,
+    settle_runs,
+)
 from tcmrl_data.operations.derive import Derived, check_label, summary
-from tcmrl_data.operations.planning import Plan, PlannedPart, Progress, carry_out, settle_runs
 from tcmrl_data.recipe.document import merged_about
 from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part_table import PartEntry

@@ -9,17 +9,18 @@ from pathlib import Path
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import BuildError, SelectionError
-from tcmrl_data.operations.apply import make_of_parts
-from tcmrl_data.operations.assembly import check_out, derivation_of
-from tcmrl_data.operations.planning import (
+from tcmrl_data.operations.apply import (
     Pair,
     check_parts,
     jobs_of_pairs,
     keys_of_run,
+    make_of_parts,
     nearest_pairs,
+    runs_like,
     runs_of_pairs,
     simulated_run,
 )
+from tcmrl_data.operations.assembly import check_out, derivation_of
 from tcmrl_data.parts.jobs import DeriveSpec
 from tcmrl_data.parts.making import wanted_from
 from tcmrl_data.parts.operation import Simulator, Sources, StoredPart
@@ -100,30 +101,19 @@ def relabel_dataset(
     """
     dataset = path if isinstance(path, Dataset) else open_dataset(path)
     out = Path(out)
-    source_run, recipe, seed = simulated_run(dataset, of)
+    source, recipe, seed = simulated_run(dataset, of)
     sources = _sources(dataset, tasks, allow_test)
     pairs = _pairs(dataset, sources, to, allow_test)
     keys = keys_of_run(dataset, of, [task.index for task in sources], snapshots)
     names = runs_of_pairs(pairs, run)
-    jobs = jobs_of_pairs(names, keys)
-    check_parts(dataset, source_run, sorted({job.source for job in jobs}), policy=False)
-    runs = [
-        Run(
-            name=name,
-            kind="relabelled",
-            seed=seed,
-            recipe=recipe,
-            origin={"operation": RELABEL, "of": of},
-            steps=None,
-            sources=tuple(
-                sorted((target, source) for (source, target), found in names.items() if found == name)
-            ),
-        )
-        for name in dict.fromkeys(names.values())
-    ]
+    jobs = tuple(jobs_of_pairs(names, keys))
+    check_parts(dataset, source, sorted({job.source for job in jobs}), policy=False)
+    origin = {"operation": RELABEL, "of": of}
+    template = Run(name=run, kind="relabelled", seed=seed, recipe=recipe, origin=origin, steps=None)
+    runs = runs_like(template, names)
     if len(runs) > MAX_RUNS:
         raise BuildError(f"{out} would have {len(runs)} runs, more than {MAX_RUNS}; choose fewer --to tasks")
-    settings = {
+    recorded = {
         "to": to if isinstance(to, str) else sorted(set(to)),
         "tasks": sorted(task.index for task in sources),
         "snapshots": snapshots,
@@ -131,17 +121,24 @@ def relabel_dataset(
         "run": run,
         "allow_test": allow_test,
     }
-    derivation = derivation_of(RELABEL, settings, [dataset])
+    derivation = derivation_of(RELABEL, recorded, [dataset])
     check_out(out, derivation)
-    common = {"first_episode": first_episode_of(source_run)}
-    spec = DeriveSpec(dataset.path.resolve(), out.resolve(), RELABEL, common, recipe, seed, tuple(jobs))
+    common = {"first_episode": first_episode_of(source)}
+    spec = DeriveSpec(dataset.path, out, RELABEL, common, recipe, seed, jobs)
     _try_out(dataset, spec)
     steps = sum(dataset.entry(job.source).steps for job in jobs)
     counts = (tuple(found.name for found in runs), len(pairs), len(jobs), steps)
     if dry_run:
         return RelabelReport(out, *counts, None)
     manifest = make_of_parts(
-        dataset, out, spec, derivation, runs=runs, label=label, workers=workers, progress=progress
+        dataset,
+        out,
+        spec,
+        derivation=derivation,
+        runs=runs,
+        label=label,
+        workers=workers,
+        progress=progress,
     )
     return RelabelReport(out, *counts, manifest.root)
 

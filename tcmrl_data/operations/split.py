@@ -8,9 +8,16 @@ from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.base import Split, in_order
 from tcmrl_data.foundation.errors import ManifestError, SelectionError
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
-from tcmrl_data.operations.assembly import check_out, derivation_of
+from tcmrl_data.operations.assembly import (
+    Plan,
+    PlannedPart,
+    Progress,
+    carry_out,
+    check_out,
+    derivation_of,
+    settle_runs,
+)
 from tcmrl_data.operations.derive import Derived, summary, write_view
-from tcmrl_data.operations.planning import Plan, PlannedPart, Progress, carry_out, settle_runs
 from tcmrl_data.parts.own_operations import Cut
 from tcmrl_data.store.manifest import EPISODES, FOLD, read_manifest
 

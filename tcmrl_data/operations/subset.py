@@ -13,8 +13,7 @@ from tcmrl_data.dataset.selection import MEDIUM_SCORE, task_scores
 from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator
-from tcmrl_data.operations.assembly import derivation_of
-from tcmrl_data.operations.planning import Plan, PlannedPart, settle_runs
+from tcmrl_data.operations.assembly import Plan, PlannedPart, derivation_of, settle_runs
 from tcmrl_data.parts.own_operations import SUBSET, Cut
 from tcmrl_data.store.part import STANDARD_ARRAYS
 from tcmrl_data.store.tables import PartKey

@@ -66,8 +66,8 @@ class DeriveSpec:
     def to_json(self) -> dict[str, Any]:
         """JSON form."""
         return {
-            "source": str(self.source),
-            "out": str(self.out),
+            "source": str(self.source.resolve()),
+            "out": str(self.out.resolve()),
             "operation": self.operation,
             "settings": dict(self.settings),
             "recipe": self.recipe.model_dump(mode="json"),

@@ -13,8 +13,8 @@ from pydantic import ValidationError
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, SnapshotError, StoreError, TcmrlError
 from tcmrl_data.foundation.plain_files import one_line
+from tcmrl_data.operations.assembly import Plan, PlannedPart
 from tcmrl_data.operations.merge import MERGE, plan_merge
-from tcmrl_data.operations.planning import Plan, PlannedPart
 from tcmrl_data.operations.split import plan_episodes, plan_fold
 from tcmrl_data.operations.subset import Choice, plan_subset
 from tcmrl_data.parts.making import one_thread
