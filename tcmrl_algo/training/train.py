@@ -25,7 +25,7 @@ from tcmrl_algo.training.checkpoint import EVALUATIONS, Run, RunRecord, open_run
 from tcmrl_algo.training.config import method_of, stage_plan
 from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError
 from tcmrl_data.foundation.errors import DivergenceError
-from tcmrl_data.foundation.process import DeferredInterrupts
+from tcmrl_data.foundation.machine import DeferredInterrupts
 
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
 """Of glibc's malloc.h; other C libraries have no `mallopt`, or ignore these."""

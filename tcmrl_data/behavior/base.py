@@ -30,9 +30,9 @@ from tcmrl_data.envs.controller import Controller, FloatArray, ObservationView
 from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json, sha256
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, named_errors, remove_tree, replace_file
 from tcmrl_data.foundation.errors import SnapshotError, StorageError, StoreError
+from tcmrl_data.foundation.machine import DeferredInterrupts
 from tcmrl_data.foundation.plain_files import one_line, printable
 from tcmrl_data.foundation.plugins import Registry
-from tcmrl_data.foundation.process import DeferredInterrupts
 
 if TYPE_CHECKING:
     import torch

@@ -11,7 +11,6 @@ from typing import Any
 
 from tcmrl_data.behavior.base import CHECKPOINT_SECONDS
 from tcmrl_data.building.ledger import Ledger
-from tcmrl_data.building.nodes import check_nodes
 from tcmrl_data.building.plan import plan_build
 from tcmrl_data.building.unit import UnitSpec
 from tcmrl_data.building.work_files import (
@@ -210,11 +209,15 @@ class Driver:
         However the units end, the manifest then names every part that was taken in.
         """
         ledger = self._ledger
-        groups = [group for group in self._plan.groups if self._missing(group)]
+        groups = [group for group in self._plan.groups if any(ledger.missing(task.index) for task in group)]
         tasks_of = {_unit_id(group): group for group in groups}
         self._steps_total = self._plan.source.training_steps * sum(map(len, groups))
         failures: list[str] = []
-        remarks = [*check_nodes(engine, self._plan, self._dataset), *self._remarks()]
+        remarks = list(self._remarks())
+        if engine.takes_address:
+            from tcmrl_data.building.nodes import check_nodes
+
+            remarks = [*check_nodes(engine, self._plan, self._dataset), *remarks]
         self._deadline = VISIBLE_SECONDS if engine.takes_address else 0.0
         ledger.begin()
         try:
@@ -274,23 +277,18 @@ class Driver:
             timeout=reserved.timeout,
         )
 
-    def _missing(self, tasks: Sequence[Task]) -> list[PartKey]:
-        """The missing parts of a group."""
-        return [key for task in tasks for key in self._ledger.missing(task.index)]
-
     def _checked(self, result: Result, tasks: Sequence[Task]) -> Result:
         """A unit's result, failed where parts are still missing."""
-        self._take_in_unreported(tasks, deadline=self._deadline if result.ok else 0.0)
-        missing = self._missing(tasks)
+        missing = self._take_in_unreported(tasks, deadline=self._deadline if result.ok else 0.0)
         if result.ok and missing:
             problem = f"it ended without {len(missing)} of its parts, the first is {part_file(missing[0])}"
             return dataclasses.replace(result, ok=False, error=problem)
         return result
 
-    def _take_in_unreported(self, tasks: Sequence[Task], *, deadline: float = 0.0) -> None:
-        """Takes in parts whose messages were lost, with the worker that published them."""
-        for task in tasks:
-            self._ledger.take_in_unreported(task.index, deadline=deadline)
+    def _take_in_unreported(self, tasks: Sequence[Task], *, deadline: float = 0.0) -> list[PartKey]:
+        """Takes in parts whose messages were lost, with their workers; returns the missing."""
+        take_in = self._ledger.take_in_unreported
+        return [key for task in tasks for key in take_in(task.index, deadline=deadline)]
 
     def _on_message(self, unit: str, message: Mapping[str, Any], log: StatusFile) -> None:
         if message["kind"] == "steps":

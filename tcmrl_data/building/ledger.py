@@ -160,19 +160,23 @@ class Ledger:
             self.seal()
         return True
 
-    def take_in_unreported(self, task: int, *, deadline: float = 0.0) -> None:
-        """Adds the parts of a task whose reports were lost; damaged ones count as missing.
+    def take_in_unreported(self, task: int, *, deadline: float = 0.0) -> list[PartKey]:
+        """Adds the parts of a task whose reports were lost; returns those that are missing or damaged.
 
         Args:
             task: index of the task.
             deadline: seconds to wait at most for a file that another machine may have published.
         """
+        missing = []
         for key in self.missing(task):
-            if wait_until_visible(self._out / part_file(key), deadline=deadline):
-                published = self._read(key)
-                if published is not None:
-                    self._add(key)
-                    self._record(published)
+            visible = wait_until_visible(self._out / part_file(key), deadline=deadline)
+            published = self._read(key) if visible else None
+            if published is None:
+                missing.append(key)
+            else:
+                self._add(key)
+                self._record(published)
+        return missing
 
     def is_sealed(self) -> bool:
         """Whether the manifest on disk says all that is known here."""

@@ -18,7 +18,7 @@ from types import FrameType
 from typing import Any
 
 from tcmrl_data.foundation.errors import TcmrlError
-from tcmrl_data.foundation.process import leave_out_compiler
+from tcmrl_data.foundation.machine import leave_out_compiler
 
 REPORT_SECONDS = 0.5
 

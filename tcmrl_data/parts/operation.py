@@ -10,14 +10,13 @@ import dataclasses
 import functools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Generic, TypeVar, final
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar, final
 
 import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel
 
 from tcmrl_data.behavior.base import Snapshot, read_snapshot
-from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.base import Environment, Lanes, Task
 from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.errors import BuildError, RenderingError, StoreError, TrajectoryError
@@ -28,6 +27,9 @@ from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.manifest import FOREIGN_KINDS, Run, RunKind
 from tcmrl_data.store.part import DATA_VERSION, PartRecord, Platform, this_platform
 from tcmrl_data.store.tables import PartKey
+
+if TYPE_CHECKING:
+    from tcmrl_data.dataset.dataset import Dataset
 
 OperationSettings = TypeVar("OperationSettings", bound=BaseModel)
 
@@ -74,7 +76,7 @@ class StoredPart:
     first: int | None = None
 
     @classmethod
-    def of(cls, dataset: Dataset, key: PartKey) -> "StoredPart":
+    def of(cls, dataset: "Dataset", key: PartKey) -> "StoredPart":
         """A part of a dataset, whose bytes are those of the table.
 
         Raises:
@@ -112,7 +114,7 @@ class StoredPart:
         return dataclasses.replace(self, first=number)
 
 
-def _read_of(dataset: Dataset, key: PartKey, names: Iterable[str]) -> Mapping[str, npt.NDArray[Any]]:
+def _read_of(dataset: "Dataset", key: PartKey, names: Iterable[str]) -> Mapping[str, npt.NDArray[Any]]:
     return dataset.arrays(*key, names=names)
 
 
