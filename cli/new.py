@@ -5,11 +5,12 @@ from pathlib import Path
 import click
 
 from .frame import next_commands, output_options, print_json
+from .options import PATH
 
 
 @click.command()
 @click.argument("name")
-@click.option("--out", type=click.Path(path_type=Path), help="Folder to make; ./NAME by default.")
+@click.option("--out", type=PATH, metavar="FOLDER", help="Folder to create; ./NAME by default.")
 @output_options
 def new(name: str, out: Path | None, as_json: bool) -> None:
     """Write a package with an environment of your own, ready to build.

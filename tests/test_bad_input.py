@@ -73,7 +73,7 @@ CASES: dict[str, tuple[str, tuple[str, ...]]] = {
     "import, no file": ("import hdf5 {folder}/no.hdf5 --out {new}", ("no.hdf5",)),
     "import, another environment": (
         "import hdf5 {exported} --environment half-cheetah-vel --out {new}",
-        ("2 columns of observations", "half-cheetah-vel"),
+        ("observations, actions and horizon are (2, 2, 5)", "half-cheetah-vel"),
     ),
     "export, unknown format": ("export {data} --format hdf6 --out {new}", ("'hdf6'", "hdf5")),
     "export, unknown tier": (

@@ -152,7 +152,7 @@ def test_the_argument_is_called_dataset_everywhere() -> None:
     assert {metavar for name, metavar in named if name in ("dataset", "left")} == {"DATASET"}
     assert {metavar for _, metavar in named} == {
         *("DATASET", "OTHER", "DATASET…", "ENV|FILE", "FORMAT", "FILE…", "ZIP", "[FOLDER]"),
-        *("RUN", "RUNS...", "FILE|NAME"),
+        *("RUN", "RUNS...", "FILE|NAME", "NAME"),
     }
 
 
@@ -190,4 +190,4 @@ def test_a_dataset_in_place_of_a_command_is_answered_with_the_command_to_choose(
 ) -> None:
     call = in_process(data, capsys)
     assert_refused(call("inspect", tiny_folder), "`tcmrl-data inspect returns|tasks|", f"{tiny_folder}`")
-    assert_refused(call(tiny_folder), "`tcmrl-data build|import|", f"card {tiny_folder}`")
+    assert_refused(call(tiny_folder), "`tcmrl-data build|new|import|", f"card {tiny_folder}`")
