@@ -68,6 +68,7 @@ class Chromium:
         """Opens a file and waits until it is loaded and its figures are drawn."""
         self.resize(width, height)
         self._loaded = False
+        self._call("Emulation.setEmulatedMedia", media="")  # not as the last page was printed
         self._call("Page.navigate", url=file.resolve().as_uri())
         deadline = time.monotonic() + SECONDS
         while not self._loaded and time.monotonic() < deadline:

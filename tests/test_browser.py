@@ -102,6 +102,8 @@ def test_a_report_of_results(browser: Chromium, tmp_path: Path) -> None:
     assert browser.evaluate("document.images.length") == len(page.figures) >= 2
     assert browser.evaluate("Array.from(document.images).every(image => image.naturalWidth > 0)")
     assert_quiet(browser)
+    browser.print_preview()
+    browser.wait(f"{OVERFLOW} <= 0")
 
 
 def test_the_browser_sees_what_it_should(browser: Chromium, tmp_path: Path) -> None:
