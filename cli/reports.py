@@ -154,8 +154,8 @@ def runs(folder: Path | None, as_json: bool) -> None:
     table = make_table(
         f"Runs in {folder}",
         columns=["run", "trained", "steps", "dataset", "last return"],
-        text=["dataset"],
-        long_text=["run", "trained"],
+        text=["run", "dataset"],  # a run's name is never folded: it is copied
+        long_text=["trained"],
     )
     for row in rows:
         table.add_row(*_cells(row))

@@ -17,6 +17,7 @@ from tcmrl_data import CheckpointError, Dataset, SelectionError, TrainingError
 from tests.commands import Call, assert_refused, in_process
 from tests.datasets import with_tasks
 from tests.small_training import SMALL, config_of
+from tests.terminal import as_in_terminal
 
 Train = Callable[..., tcmrl_algo.TrainingReport]
 
@@ -295,6 +296,8 @@ def test_the_list_of_runs_says_how_far_they_are(start: Train, tmp_path: Path, ca
     assert (first["path"], first["algorithm"], first["seed"]) == (str(folder), "tcmrl", 3)
     assert (first["step"], first["steps"], first["evaluation"]["final"]) == (10, 10, -2.5)
     assert "run.json" in second["error"]
+    narrow = as_in_terminal(tcmrl, "runs", tmp_path, columns=40).output
+    assert first["path"] in narrow  # in one piece, to be copied
     output = call("runs", tmp_path)[1]
     assert "tcmrl on point-robot, seed 3" in output and "10/10" in output and "idaq -2.50" in output
     assert first["root"][:12] in output
