@@ -170,7 +170,17 @@ def test_pyarrow_reads_one_table_of_all_files(tiny: Dataset, tmp_path: Path) -> 
     }.items():
         np.testing.assert_array_equal(np.array(one.column(column).to_pylist(), rows.dtype), rows)
     assert one.column("run").unique().to_pylist() == ["main"]
+    assert table.column("split").unique().to_pylist() == ["train"]
+    (goal,) = {tuple(goal) for goal in one.column("parameter_goal").to_pylist()}
+    assert list(goal) == tiny.task(40).parameters["goal"]
     assert json.loads(one.schema.metadata[b"tcmrl"])["split"] == "train"
+
+
+def test_parquet_lies_in_a_folder_per_split(tiny: Dataset, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    report = export_dataset(tiny, "parquet", tmp_path / "out", snapshots="last")
+    places = {str(file.relative_to(tmp_path / "out")) for file in report.files}
+    assert places == {f"{task.split}/task_{task.index:05d}.parquet" for task in tiny.tasks}
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -1,8 +1,10 @@
-"""Parquet, one file per task, `task_00000.parquet` and so on: one row a transition.
+"""Parquet, one file per task, `train/task_00000.parquet` and so on: one row a transition.
 
 | column | type | holds |
 |---|---|---|
 | task, step | int32 | index of the task, and the snapshot's training step |
+| split | text | of the task: `train` or `test` |
+| parameter_goal … | float64, a list of them, or text | what defines the task |
 | run | text | of the part |
 | episode, time | int32 | number of the episode in the file, and of the row in it |
 | observation, next_observation | list of float32, of a fixed length | |
@@ -32,6 +34,7 @@ import numpy.typing as npt
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.foundation.canonical import leaves
 from tcmrl_data.foundation.disk import named_errors
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.interchange.exporting import REMEDY, Format, transitions
@@ -57,7 +60,7 @@ METADATA_KEY = "tcmrl"
 GROUP_ROWS = 2**16
 """Rows of a row group, or up to a part more: what is in memory at a time."""
 
-INDEX_COLUMNS = ["task", "step", "run", "episode", "time"]
+INDEX_COLUMNS = ["task", "split", "step", "run", "episode", "time"]
 SETTINGS = {"compression": "zstd", "use_dictionary": INDEX_COLUMNS, "write_statistics": INDEX_COLUMNS}
 
 COLUMNS = {
@@ -72,8 +75,11 @@ COLUMNS = {
 
 NEEDED = ("episode", *COLUMNS.values())
 STEP = "step"
-UNUSED = ("task", "run", "time")
+UNUSED = ("task", "split", "run", "time")
 """What the metadata and the order of rows say too, or a dataset has no place for."""
+
+PARAMETER = "parameter_"
+"""Begins the names of the columns with the task's parameters."""
 
 BATCH_ROWS = 2**12
 ITEM_BYTES = {"BOOLEAN": 1, "INT32": 4, "FLOAT": 4}
@@ -92,6 +98,9 @@ class ParquetFormat(Format):
     optional_packages = ("pyarrow",)
     extra = "tcmrl[parquet]"
 
+    def place(self, selection: Selection, task: Task) -> str:
+        return f"{task.split}/{super().place(selection, task)}"
+
     def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
         from pyarrow import concat_tables, parquet
 
@@ -102,7 +111,7 @@ class ParquetFormat(Format):
         with named_errors(path, remedy=REMEDY), contextlib.ExitStack() as stack:
             file = stack.enter_context(path.open("xb"))
             for key, trajectories in self.parts(selection, task, path):
-                waiting.append(_table(trajectories, key, first=episodes))
+                waiting.append(_table(trajectories, task, key, first=episodes))
                 episodes += len(trajectories)
                 if writer is None:
                     schema = waiting[0].schema.with_metadata(metadata)
@@ -115,24 +124,43 @@ class ParquetFormat(Format):
                 writer.write_table(concat_tables(waiting))
 
 
-def _table(trajectories: Sequence[Trajectory], key: PartKey, *, first: int) -> "pyarrow.Table":
+def _table(trajectories: Sequence[Trajectory], task: Task, key: PartKey, *, first: int) -> "pyarrow.Table":
     """The rows of a part; `first` numbers its first episode."""
     import pyarrow
 
     arrays = transitions(trajectories, first=first, step=key.step)
     episode, step = (arrays.pop(name).astype(np.int32) for name in ("episode", "step"))
+    every_row = pyarrow.array(np.zeros_like(step))
     columns = {
         "task": pyarrow.array(np.full_like(step, key.task)),
+        "split": pyarrow.array([task.split]).take(every_row),
         "step": pyarrow.array(step),
-        "run": pyarrow.array([key.run]).take(pyarrow.array(np.zeros_like(step))),
+        "run": pyarrow.array([key.run]).take(every_row),
         "episode": pyarrow.array(episode),
         "time": pyarrow.array(np.concatenate([np.arange(len(one), dtype=np.int32) for one in trajectories])),
     }
     for name in dict.fromkeys([*COLUMNS, *arrays]):
         array = arrays[name]
         columns[COLUMNS.get(name, name)] = _lists(array) if array.ndim == 2 else pyarrow.array(array)
+    for name, value in _parameters(task).items():
+        columns[name] = pyarrow.array([value]).take(every_row)
     fields = [pyarrow.field(name, column.type, nullable=False) for name, column in columns.items()]
     return pyarrow.table(columns, schema=pyarrow.schema(fields))
+
+
+def _parameters(task: Task) -> dict[str, float | list[float] | str]:
+    """The task's parameters by column; whole numbers too become floats, so that all tasks have one type."""
+    values: dict[str, float | list[float] | str] = {}
+    for path, value in leaves(task.parameters):
+        numbers = value if isinstance(value, list | tuple) else [value]
+        if isinstance(value, str):
+            made: float | list[float] | str = value
+        elif all(isinstance(number, int | float) for number in numbers):
+            made = float(value) if numbers == [value] else [float(number) for number in numbers]
+        else:
+            made = json.dumps(value)
+        values[PARAMETER + "_".join(path)] = made
+    return values
 
 
 def _lists(rows: npt.NDArray[np.float32]) -> "pyarrow.Array":
@@ -157,7 +185,11 @@ class ParquetReader(Reader):
         limit = decoded_limit(require_file(path).stat().st_size)
         with damage_at(f"{path} does not open as Parquet:"):
             file = parquet.ParquetFile(path)
-        names = [field.name for field in file.schema_arrow if _holds_numbers(field.type)]
+        names = [
+            field.name
+            for field in file.schema_arrow
+            if _holds_numbers(field.type) and not field.name.startswith(PARAMETER)
+        ]
         missing = [name for name in NEEDED if name not in names]
         if missing:
             raise StoreError(f"{path}: has no column {missing[0]} of numbers, which a row a transition has")
