@@ -94,11 +94,13 @@ def test_files_are_found_and_read_by_the_rules_of_the_published_loaders(
 ) -> None:
     """`init_buffer` of FOCAL, IDAQ and TCMRL (rlkit/core/rl_algorithm.py): names, columns, float64."""
     export_dataset(tiny, "idaq-npy", tmp_path / "data")
+    in_order = [task.index for task in (*tiny.train_tasks, *tiny.test_tasks)]
+    assert json.loads((tmp_path / "data/task_numbers.json").read_text()) == in_order
     for step in (100, 150):  # `train_epoch`
-        for task in TASKS:
+        for place, task in enumerate(in_order):  # `range(n)`, the first for training
             expected = tiny.trajectories(task, step)
             for number in range(6):  # `n_trj`
-                (file,) = (tmp_path / "data").glob(f"goal_idx{task}/trj_evalsample{number}_step{step}.npy")
+                (file,) = (tmp_path / "data").glob(f"goal_idx{place}/trj_evalsample{number}_step{step}.npy")
                 rows = np.load(file, allow_pickle=True)
                 assert rows.shape == (20, 4)
                 buffers = [np.zeros((20, 2)), np.zeros((20, 2)), np.zeros((20, 1)), np.zeros((20, 2))]

@@ -129,3 +129,18 @@ def test_a_plain_array_has_no_rows(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="name the folder of the tasks"):
         import_dataset("idaq-npy", [tmp_path / "d/goal_idx0"], tmp_path / "data")
     assert not (tmp_path / "data").exists()
+
+
+@pytest.mark.parametrize(
+    ("numbers", "problem"),
+    [("[7]", "has no task 1; it lists 1"), ("[7, 7]", "names a task twice"), ('{"0": 7}', "is no list of")],
+)
+def test_numbers_of_tasks_that_do_not_fit_the_folders_are_refused(
+    numbers: str, problem: str, tmp_path: Path
+) -> None:
+    for task in (0, 1):
+        saved(tmp_path / f"d/goal_idx{task}/trj_evalsample0_step0.npy", trajectory(STEPS, seed=task))
+    (tmp_path / "d/task_numbers.json").write_text(numbers)
+    with pytest.raises(StoreError, match=problem):
+        import_dataset("idaq-npy", [tmp_path / "d"], tmp_path / "data")
+    assert not (tmp_path / "data").exists()

@@ -1,14 +1,18 @@
 """The `.npy` files that the published code of FOCAL, IDAQ, CSRO and TCMRL writes and loads.
 
-`goal_idx3/trj_evalsample7_step5000.npy` is episode 7 of the stochastic policy of task 3 after 5,000 steps,
+`goal_idx3/trj_evalsample7_step5000.npy` is episode 7 of the stochastic policy of a task after 5,000 steps,
 `trj_eval7_step5000.npy` of the deterministic one. It is an object array of rows [observation, action, reward,
 next observation], which the loaders open by `numpy.load(path, allow_pickle=True)` and index as `rows[:, 0]`.
 They choose files by name (`data_dir`, `train_epoch` for the step, `n_trj` for the number of episodes) and
 take the last row of each for the end of an episode, so that flags, extra arrays and runs have no place.
 
-`tasks.json` beside the folders lists the tasks with their splits and parameters;
-`tcmrl-data import idaq-npy FOLDER --task-file FOLDER/tasks.json` reads them back. Episodes of the published
-data end with the time limit, so every last step is read as truncated, and the import says so.
+An export numbers its tasks from 0 without gaps, training tasks first, since the published launchers take the
+first numbers for training and the last ones for test. `task_numbers.json` lists the indices of the tasks by
+these numbers, and `import` gives them back. `tasks.json` lists the tasks with their splits and parameters;
+`tcmrl-data import idaq-npy FOLDER --task-file FOLDER/tasks.json` reads them back.
+
+Episodes of the published data end with the time limit, so every last step is read as truncated, and the
+import says so.
 
 An object array is a pickle, which could run anything. It is read by the standard library's unpickler with an
 allow-list of the names that NumPy's arrays need. The names stand for functions of this module and not for
@@ -16,6 +20,7 @@ NumPy's own: those take a forged type's word for what is a pointer, and crash or
 one in Python, since the one in C reserves as much memory as a pickle asks for.
 """
 
+import json
 import os
 import pickle
 import re
@@ -32,6 +37,7 @@ import numpy.typing as npt
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.disk import disk, named_errors
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
@@ -54,6 +60,7 @@ from tcmrl_data.store.tables import PartKey, task_line
 Policy = Literal["sample", "deterministic"]
 
 TASKS_FILE = "tasks.json"
+NUMBERS_FILE = "task_numbers.json"
 COLUMNS = 4
 
 LARGEST_FILE = 2**22
@@ -86,7 +93,7 @@ class IdaqNpyFormat(Format):
     name = "idaq-npy"
 
     def place(self, selection: Selection, task: Task) -> str:
-        return f"goal_idx{task.index}"
+        return f"goal_idx{_numbered(selection).index(task.index)}"
 
     def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
         with named_errors(path, remedy=REMEDY):
@@ -102,7 +109,15 @@ class IdaqNpyFormat(Format):
 
     def accompanying(self, selection: Selection) -> Mapping[str, bytes]:
         lines = b",\n".join(task_line(task).strip() for task in selection.tasks)
-        return {TASKS_FILE: b"[\n" + lines + b"\n]\n"}
+        numbers = json.dumps(_numbered(selection)).encode()
+        return {TASKS_FILE: b"[\n" + lines + b"\n]\n", NUMBERS_FILE: numbers + b"\n"}
+
+
+def _numbered(selection: Selection) -> list[int]:
+    """The indices of the tasks by their numbers in the export: training tasks first."""
+    return [
+        task.index for task in sorted(selection.tasks, key=lambda task: (task.split == "test", task.index))
+    ]
 
 
 def _pickled(trajectory: Trajectory) -> bytes:
@@ -148,16 +163,20 @@ class IdaqNpyReader(Reader):
     options: IdaqNpyOptions
 
     def files(self, path: Path) -> list[Path]:
-        return [file.path for file in self._chosen(path, None)]
+        numbers = [path / NUMBERS_FILE] if (path / NUMBERS_FILE).exists() else []
+        return [*numbers, *(file.path for file in self._chosen(path, None))]
 
     def read(self, path: Path, say: Say | None = None) -> Iterator[ReadPart]:
+        indices = _task_indices(path)
         parts: dict[tuple[int, int], list[_File]] = defaultdict(list)
         for file in self._chosen(path, say):
             parts[file.task, file.step].append(file)
         cuts = EpisodeCuts()
         for (task, step), files in parts.items():
             yield ReadPart(
-                FileTask(task), step, [episode for file in files for episode in _read(file.path, cuts)]
+                FileTask(indices(task)),
+                step,
+                [episode for file in files for episode in _read(file.path, cuts)],
             )
         cuts.tell(say, path)
 
@@ -178,6 +197,30 @@ class IdaqNpyReader(Reader):
         if say is not None and len(chosen) < len(found):
             say(f"{path.name}: {len(found) - len(chosen):,} episodes of the other policy are left out")
         return chosen
+
+
+def _task_indices(path: Path) -> Callable[[int], int]:
+    """The index of the task with a number: the number itself, or what an export's `task_numbers.json` says.
+
+    Raises:
+        StoreError: the file is no list of indices, or too short.
+    """
+    file = path / NUMBERS_FILE
+    if not file.exists():
+        return lambda number: number
+    with damage_at(str(file)):
+        indices = parse_json(read_plain_file(file, limit=LARGEST_FILE))
+        if not isinstance(indices, list) or not all(type(index) is int and index >= 0 for index in indices):
+            raise ValueError("is no list of task indices")
+        if len(set(indices)) < len(indices):
+            raise ValueError("names a task twice")
+
+    def index(number: int) -> int:
+        if number >= len(indices):
+            raise StoreError(f"{file}: has no task {number}; it lists {len(indices)}")
+        return int(indices[number])
+
+    return index
 
 
 def _list(path: Path) -> Iterator[_File]:
