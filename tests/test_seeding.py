@@ -66,6 +66,7 @@ def test_purposes_keep_their_numbers() -> None:
         "TRANSFER_RESET": 20,
         "TRANSFER_NOISE": 21,
         "VISIBILITY": 22,
+        "OPERATION": 23,
     }
 
 

@@ -11,6 +11,7 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_algo
 from tcmrl_algo import open_run, resume_run, train_run
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm
 from tcmrl_algo.algorithms.core.method import METHODS
 from tcmrl_algo.training.train import TrainingProgress
 from tcmrl_data import CheckpointError, Dataset, SelectionError, TrainingError
@@ -86,6 +87,16 @@ def test_a_run_killed_between_checkpoints_resumes_from_the_last(
     straight = start("straight", steps=60)
     assert resumed.digest == straight.digest
     assert _metrics(killed.folder) == _metrics(straight.run.folder)  # lines after step 25 are dropped
+
+
+def test_an_error_of_a_method_before_the_first_checkpoint_blocks_no_next_run(
+    start: Train, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(ContextAlgorithm, "loss", lambda *_: torch.zeros(2) @ torch.zeros(3))
+        with pytest.raises(RuntimeError, match="size"):
+            start("run", steps=30)
+    assert start("run", steps=10).step == 10
 
 
 def _metrics(folder: Path) -> list[dict[str, float]]:

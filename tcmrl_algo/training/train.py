@@ -23,7 +23,7 @@ from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_algo.training.batches import StagedBatches, open_batches
 from tcmrl_algo.training.checkpoint import EVALUATIONS, Run, RunRecord, open_run, tensors_digest, write_run
 from tcmrl_algo.training.config import method_of, stage_plan
-from tcmrl_data import CheckpointError, Dataset, Prefetch, TrainingError
+from tcmrl_data import CheckpointError, Dataset, Prefetch, TcmrlError, TrainingError
 from tcmrl_data.foundation.errors import DivergenceError
 from tcmrl_data.foundation.machine import DeferredInterrupts
 
@@ -230,7 +230,14 @@ def train_run(
     )
     algorithm = create_algorithm(record, dataset)
     run = write_run(Path(out), record)  # only now: what cannot start leaves nothing behind
-    return _train(run, algorithm, batches, start=0, report=report)
+    try:
+        return _train(run, algorithm, batches, start=0, report=report)
+    except TcmrlError:
+        raise  # such as a diverged loss, whose metrics say how
+    except Exception:  # of a method's code: there is nothing to go on with, and the next try is not blocked
+        if not run.checkpoints():
+            (run.folder / "run.json").unlink()
+        raise
 
 
 def resume_run(

@@ -42,6 +42,8 @@ class Purpose(enum.IntEnum):
     TRANSFER_RESET = 20
     TRANSFER_NOISE = 21
     VISIBILITY = 22
+    OPERATION = 23
+    """Of operations of other packages."""
 
 
 def environment_key(environment: str) -> int:

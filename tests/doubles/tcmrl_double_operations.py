@@ -49,7 +49,7 @@ class ActionNoise(Operation[NoiseSettings]):
         simulator, made = sources.running, []
         stored, number = sources.part.episodes(), simulator.num_lanes
         for first in range(0, len(stored), number):
-            key = (simulator.seed, simulator.environment.name, wanted.task.index, Purpose.EXTENSION_NOISE)
+            key = (simulator.seed, simulator.environment.name, wanted.task.index, Purpose.OPERATION)
             noises = [keyed_generator(*key, wanted.step, first + lane) for lane in range(number)]
             actions = [
                 (episode.actions + noise.normal(0.0, self.settings.sigma, episode.actions.shape)).astype(
