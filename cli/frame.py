@@ -19,6 +19,7 @@ import click
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.foundation.machine import ENDING, leave_out_compiler, open_closed_streams, sleep_soon
 from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.plugins import missing_package
 
 from .groups import GONE, gone
 
@@ -105,6 +106,10 @@ def run(command: click.Command, arguments: Sequence[str] | None = None) -> int:
         return _fail(error.format_message(), BAD_INPUT)
     except TcmrlError as error:
         return _fail(str(error), BAD_INPUT)
+    except ModuleNotFoundError as error:
+        if str(error.name).startswith("tcmrl"):
+            raise
+        return _fail(f"this command {missing_package(error)}", BAD_INPUT)
     except click.Abort:
         return _fail(INTERRUPTED, INCOMPLETE)
     except OSError as error:

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 from typing import Generic, TypeVar
 
-from tcmrl_data.foundation.errors import PluginError, UnknownNameError
+from tcmrl_data.foundation.errors import MissingPackageError, PluginError, UnknownNameError
 
 Kind = TypeVar("Kind")
 
@@ -39,6 +39,7 @@ class Registry(Generic[Kind]):
 
         Raises:
             UnknownNameError: no package declares the name; the message lists similar names.
+            MissingPackageError: one of ours, and a package is not installed that reading does without.
             PluginError: the plug-in cannot be imported, is not a usable subclass of the base class, or two
                 packages declare its name.
         """
@@ -55,6 +56,8 @@ class Registry(Generic[Kind]):
             found = entry.load()
             defect = self.defect(found, name)
         except (Exception, SystemExit) as error:  # importing a module may raise anything
+            if isinstance(error, ModuleNotFoundError) and _package(entry) == "'tcmrl'":
+                raise MissingPackageError(f"{self.noun} {name!r} {missing_package(error)}") from None
             raise PluginError(f"{problem}: {one_line_error(error)}; {remedy}") from error
         if defect:
             raise PluginError(f"{problem}: {entry.value} {defect}; {remedy}")
@@ -126,6 +129,14 @@ def check_declared(group: str, noun: str, name: str) -> None:
 
 def _package(entry: EntryPoint) -> str:
     return repr(entry.dist.name if entry.dist else "unknown")
+
+
+def missing_package(error: ModuleNotFoundError) -> str:
+    """What to do where only the packages are installed that reading needs."""
+    return (
+        f"needs the package {error.name}, which is not installed; `pip install tcmrl` brings all, "
+        "requirements-reader.txt only what reading needs"
+    )
 
 
 def one_line_error(error: BaseException) -> str:
