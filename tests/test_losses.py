@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import pytest
 import torch
@@ -25,11 +26,10 @@ from tcmrl_algo.algorithms.tcmrl import (
     task_contrastive_loss,
 )
 from tcmrl_algo.algorithms.tcmrl_variants import (
-    NegativeKind,
     centered_sparsity_loss,
     entropy_sparsity_loss,
+    extreme_rewards,
     literal_sparsity_loss,
-    negative_rewards,
     orthogonality_loss,
 )
 
@@ -53,10 +53,6 @@ DIFFERENTIABLE: dict[str, tuple[Callable[..., Tensor], tuple[Tensor, ...]]] = {
     "reverse_context": (
         lambda c, w: reverse_context(c, w, MASK).square().sum(),
         (random(2, 3, 4), random(2, 3, seed=1)),
-    ),
-    "negative_rewards": (
-        lambda r: negative_rewards(r, MASK, kind="random", noise=NOISE).square().sum(),
-        (random(2, 3),),
     ),
     "positive_reward": (
         lambda p, r: positive_reward_loss(p, r, MASK),
@@ -203,15 +199,10 @@ def test_reverse_context_of_a_single_step_is_zero() -> None:
     torch.testing.assert_close(result, torch.zeros(1, 2))
 
 
-@pytest.mark.parametrize(
-    ("kind", "expected"),
-    [("random", [1.5, 3.0, -1.0]), ("max", [3.0, 3.0, 3.0]), ("min", [1.0, 1.0, 1.0])],
-)
-def test_negative_rewards(kind: NegativeKind, expected: list[float]) -> None:
-    rewards, mask = torch.tensor([[1.0, 3.0, -7.0]]), torch.tensor([[True, True, False]])
-    noise = torch.tensor([[0.5, 0.0, 6.0]])
-    result = negative_rewards(rewards, mask, kind=kind, noise=noise)
-    torch.testing.assert_close(result, torch.tensor([expected]))
+@pytest.mark.parametrize(("kind", "expected"), [("max", 3.0), ("min", 1.0)])
+def test_extreme_rewards(kind: Literal["max", "min"], expected: float) -> None:
+    rewards, mask = torch.tensor([[1.0, 3.0, -7.0, 9.0]]), torch.tensor([[True, True, False, False]])
+    torch.testing.assert_close(extreme_rewards(rewards, mask, kind=kind), torch.full((1, 4), expected))
 
 
 @pytest.mark.parametrize("loss", [positive_reward_loss, negative_reward_loss])

@@ -34,7 +34,7 @@ from tcmrl_algo.algorithms.tcmrl import (
     sparsity_loss,
     task_contrastive_loss,
 )
-from tcmrl_algo.algorithms.tcmrl_variants import negative_rewards, orthogonality_loss
+from tcmrl_algo.algorithms.tcmrl_variants import orthogonality_loss
 from tests.published_batches import BATCHES, LATENT, PublishedBatch, published_batch
 
 DISTANCE_WEIGHT = 10.0
@@ -163,7 +163,7 @@ def test_reward_losses_are_squares_where_the_published_ones_are_smooth(index: in
     ours = positive_reward_loss(good, rewards, mask)
     close(ours, TCMRL["estimator"][index])
     close(ours / 2 - smooth(good - rewards).mean(), TCMRL["positive"][index])
-    wrong = negative_rewards(rewards, mask, kind="random", noise=tensor(batch.noise))
+    wrong = rewards + tensor(batch.noise)
     ours = negative_reward_loss(bad, wrong, mask)
     close(ours / 2 - smooth(bad - wrong).mean(), TCMRL["negative"][index])
     assert bool(smooth(good - rewards).any()) is (index == 4)

@@ -1,6 +1,9 @@
 """TCMRL on synthetic batches: which loss trains which network, masks, contexts, and switches."""
 
+import sys
 from dataclasses import replace
+from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import pytest
@@ -13,7 +16,6 @@ from tcmrl_algo.algorithms import tcmrl
 from tcmrl_algo.algorithms.core.context import ContextAlgorithm, ContextLosses
 from tcmrl_algo.algorithms.core.networks import call_frozen
 from tcmrl_algo.algorithms.tcmrl import negative_reward_loss, reverse_context, task_contrastive_loss
-from tcmrl_algo.algorithms.tcmrl_variants import negative_rewards
 from tcmrl_algo.experiment.spec import load_experiment
 from tcmrl_data import Batch, Steps
 from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, with_steps
@@ -74,6 +76,24 @@ def gradients(weights: dict[str, float]) -> dict[str, float]:
         part = name.split(".")[0]
         found[part] = max(found.get(part, 0.0), size)
     return found
+
+
+def test_a_training_step_is_read_in_at_most_twelve_files() -> None:
+    made, values, files = method(), batch(), set[Path]()
+    made.update(values, 1)  # what happens in the first step alone does not count
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        if event == "call":
+            files.add(Path(frame.f_code.co_filename))
+
+    sys.setprofile(note)
+    try:
+        made.update(values, 2)
+    finally:
+        sys.setprofile(None)
+    root = Path(tcmrl_data.__file__).parents[1]
+    own = {str(file.relative_to(root)) for file in files if file.is_relative_to(root)}
+    assert len([name for name in own if name.startswith(("tcmrl_algo", "tcmrl_data"))]) <= 12, sorted(own)
 
 
 def test_positive_loss_trains_encoder_extractor_and_estimator() -> None:
@@ -228,7 +248,7 @@ def test_negative_estimation_with_noise_of_mean_zero_fits_the_true_rewards() -> 
         attention = made.attention(batch()["context"])
         execution = made.encoder.read(batch()["execution"])
         noise = sign * torch.randn(execution.rewards.shape, generator=torch.Generator().manual_seed(5))
-        wrong = negative_rewards(execution.rewards, execution.mask, kind="random", noise=noise)
+        wrong = execution.rewards + noise
         reverse = reverse_context(attention.representations, attention.weights, attention.mask)
         misled = call_frozen(made.estimator, execution.state_actions.flatten(1, 2), reverse)
         loss = negative_reward_loss(misled.view(execution.mask.shape), wrong, execution.mask)

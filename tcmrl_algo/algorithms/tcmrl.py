@@ -112,8 +112,8 @@ class TcmrlConfig(MethodConfig):
             constant and without gradient. `weights.sparsity = 0` leaves it out.
         reverse_scale: `mean` divides c_neg by T - 1 (ours), which brings it close to the mean context;
             `sum` leaves it as printed (see `reverse_context`).
-        negative_reward: how targets of L_neg are made wrong (paper, G.3: `random`). On average, `random`
-            targets are the true rewards (see `negative_reward_loss`).
+        negative_reward: how targets of L_neg are made wrong (paper, G.3: `random`, r' and noise). On average,
+            `random` targets are the true rewards (see `negative_reward_loss`).
         negative_noise: standard deviation of `random`, in standard deviations of the reward
             (published code: 0.5, of the raw reward).
         negative_bias: mean of that noise, likewise (paper and published code: 0). Any other makes `random`
@@ -133,7 +133,7 @@ class TcmrlConfig(MethodConfig):
     estimator_training: Literal["always", "positive"] = "always"
     sparsity: Literal["sigmoid", "centered", "entropy", "literal"] = "sigmoid"
     reverse_scale: Literal["mean", "sum"] = "mean"
-    negative_reward: variants.NegativeKind = "random"
+    negative_reward: Literal["random", "max", "min"] = "random"
     negative_noise: float = Field(default=0.5, ge=0)
     negative_bias: float = 0.0
     temperature: float = Field(default=1.0, gt=0)
@@ -436,7 +436,9 @@ class TcmrlLearner(ContextLearner):
             unit = self._horizon if whole else 1
             draws = torch.randn(rewards.shape, generator=generator).to(rewards.device)
             noise = config.negative_noise / unit * draws + config.negative_bias / unit
-            wrong = variants.negative_rewards(rewards, mask, kind=config.negative_reward, noise=noise)
+            wrong = rewards + noise
+            if config.negative_reward != "random":
+                wrong = variants.extreme_rewards(rewards, mask, kind=config.negative_reward)
             reverse = reverse_context(
                 attention.representations,
                 attention.weights,

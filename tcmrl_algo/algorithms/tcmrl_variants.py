@@ -12,8 +12,6 @@ from torch import Tensor
 from tcmrl_algo.algorithms.core.losses import Scalar, masked_mean
 from tcmrl_algo.algorithms.core.networks import Attention, mean_representation
 
-NegativeKind = Literal["random", "max", "min"]
-
 
 def uniform_attention(
     representations: Float[Tensor, "lanes steps latent"], mask: Bool[Tensor, "lanes steps"]
@@ -64,29 +62,12 @@ SPARSITY = {
 """Readings of Eq. 6: of the weights, and of the scores."""
 
 
-def negative_rewards(
-    rewards: Float[Tensor, "*lanes steps"],
-    mask: Bool[Tensor, "*lanes steps"],
-    *,
-    kind: NegativeKind,
-    noise: Float[Tensor, "*lanes steps"],
+def extreme_rewards(
+    rewards: Float[Tensor, "*lanes steps"], mask: Bool[Tensor, "*lanes steps"], *, kind: Literal["max", "min"]
 ) -> Float[Tensor, "*lanes steps"]:
-    """Wrong targets for L_neg: r' + noise, or the trajectory's largest or smallest reward (Appendix G.3).
-
-    Noise of mean zero makes no target wrong on average (see `negative_reward_loss`); noise of another mean,
-    `max` and `min` do.
-
-    Args:
-        rewards: r'_t of execution trajectories.
-        mask: real steps.
-        kind: `random` adds `noise`; `max` and `min` repeat the trajectory's extreme reward.
-        noise: draws of the noise distribution; used by `random` alone.
-    """
-    if kind == "random":
-        return rewards + noise
-    if kind == "max":
-        return torch.where(mask, rewards, -torch.inf).amax(-1, keepdim=True).expand_as(rewards)
-    return torch.where(mask, rewards, torch.inf).amin(-1, keepdim=True).expand_as(rewards)
+    """Wrong targets for L_neg without noise: the trajectory's largest or smallest reward (Appendix G.3)."""
+    padding, extreme = (-torch.inf, torch.amax) if kind == "max" else (torch.inf, torch.amin)
+    return extreme(torch.where(mask, rewards, padding), -1, keepdim=True).expand_as(rewards)
 
 
 def orthogonality_loss(weights: Float[Tensor, "lanes steps"]) -> Scalar:
