@@ -120,10 +120,6 @@ def belief_divergence(
     """Sum over t of KL(b_t || b_{t-1}), with b_{-1} = N(0, I), averaged over lanes (BOReL, VariBAD).
 
     The gradient reaches both beliefs of a pair.
-
-    Args:
-        means, log_variances: of b_0, ..., b_T; one belief more than steps.
-        mask: real steps; b_0 counts in every lane.
     """
     before = [functional.pad(values[:, :-1], (0, 0, 1, 0)) for values in (means, log_variances)]
     divergences = gaussian_divergence(means, log_variances.exp(), before[0], before[1].exp())
@@ -149,8 +145,6 @@ def belief_reconstruction(
 
     Args:
         predicted: for every draw of t and z_t, past and future steps alike.
-        targets: what was observed.
-        mask: real steps.
         over_steps: sum errors over steps instead of taking their mean.
     """
     errors = (predicted - targets.unsqueeze(1)).square().sum(dim=-1)

@@ -79,11 +79,6 @@ class FourierFeatures(nn.Module):
     Their mean product over two tasks estimates exp(-|p - p'|^2 / (2 P)), whose width grows with the number of
     parameters, so that the distance of two random tasks counts as much with many parameters as with one.
     Nothing is trained: features that are could memorise the training tasks.
-
-    Args:
-        parameters: P.
-        features: how many.
-        generator: draws w and b.
     """
 
     frequencies: Tensor
@@ -104,7 +99,6 @@ class KnownTask(ContextLearner):
     """The task parameters as the context, in units of the training tasks' standard deviations.
 
     Args:
-        problem: holds the parameters.
         embedding: number of features in place of the parameters; 0 for none.
 
     Raises:

@@ -125,10 +125,8 @@ def relabelled_contrastive_loss(
     a negative the loss is 0.
 
     Args:
-        queries: representations of transitions.
         keys: of other transitions of the same task.
         negatives: of the queries' states and actions with the outcomes of another task.
-        temperature: tau.
     """
     matching = torch.einsum("rd,rd->r", queries, keys).unsqueeze(-1)
     others = torch.einsum("rd,rnd->rn", queries, negatives)

@@ -113,9 +113,7 @@ def club_penalty(
     (Cheng et al., 2020).
 
     Args:
-        representations: z_t.
         mean, variance: of q(z | s_t, a_t); hand them over without gradient.
-        mask: real transitions.
     """
     real = mask.unsqueeze(-1)
     number = real.sum(dim=1, keepdim=True).clamp(min=1)

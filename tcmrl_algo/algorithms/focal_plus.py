@@ -103,11 +103,9 @@ class StepAttention(nn.Module):
 
     Args:
         hidden: width, a multiple of `heads`.
-        heads: how many.
         tokens: `steps` lets the steps of a trajectory attend to each other. `literal` is the published
             code, which makes a sequence of every single transition: the softmax over one token is 1, so
             that nothing is mixed and an affine map is left.
-        generator: draws the start.
     """
 
     def __init__(self, hidden: int, *, heads: int, tokens: TokenKind, generator: torch.Generator) -> None:
@@ -133,9 +131,7 @@ class TransitionGate(nn.Module):
     """Batch-wise attention: one weight per transition, g_t = mean of sigmoid(W_2 tanh(W_1 x_t)), in (0, 1).
 
     Args:
-        hidden: width of x_t.
         reduction: W_1 has `hidden // reduction` outputs.
-        generator: draws the start.
     """
 
     def __init__(self, hidden: int, *, reduction: int, generator: torch.Generator) -> None:
@@ -158,12 +154,9 @@ class TransformerBlock(nn.Module):
     LayerNorm divides by the biased standard deviation, the published code by the unbiased one.
 
     Args:
-        hidden: width.
-        heads: of the attention over steps.
         reduction: of the gate.
         attention: what Mix holds; `none` leaves out the first residual.
         tokens: as of `StepAttention`.
-        dropout: share.
         generator: draws the start, which is the same whatever `attention` is.
     """
 
@@ -200,7 +193,6 @@ class TransformerBlock(nn.Module):
 
         Args:
             values: x, one trajectory per lane.
-            mask: real steps.
             generator: draws dropout; None drops nothing.
         """
         if self.mix_norm is not None:
@@ -224,12 +216,7 @@ class TransitionTransformer(nn.Module):
     """x_0 = tanh(Linear(inputs)), blocks, and z_t = tanh(Linear(x)) for every transition of a trajectory.
 
     Args:
-        inputs: width of a transition.
-        latent: size of z_t.
-        hidden: width of the blocks.
-        layers: number of blocks.
         heads, reduction, attention, tokens, dropout: as of `TransformerBlock`.
-        generator: draws the start.
     """
 
     def __init__(

@@ -246,7 +246,6 @@ def read_rows(
 
     Args:
         steps: with returns; transitions (lanes, n), or trajectories (lanes, n, steps).
-        scaling: of observations.
         largest_return: unit of the returns.
         most: takes so many evenly spaced real rows of every lane, or all where there are fewer.
     """

@@ -21,10 +21,7 @@ class WeightLinear(nn.Module):
     One gradient step on the parameters changes W by a matrix of high rank (Mitchell et al., 2021).
 
     Args:
-        inputs: width of x.
-        outputs: width of y.
         code: size of z; its start is N(0, 1 / outputs^2) (published code).
-        generator: draws the start.
     """
 
     def __init__(self, inputs: int, outputs: int, *, code: int, generator: torch.Generator) -> None:
@@ -51,7 +48,6 @@ class WeightLinear(nn.Module):
         so that no lane needs a copy of F, which is by far the largest tensor.
 
         Args:
-            gradients: g, of every lane.
             rates: of z, F and f.
         """
         code_rate, factor_rate, bias_rate = rates.unbind()
@@ -75,9 +71,7 @@ class WeightPerceptron(nn.Module):
     """A ReLU perceptron of weight-linear layers, which is run with given weights.
 
     Args:
-        sizes: width of input, hidden layers (at least one) and output.
         code: size of every layer's code.
-        generator: draws the start.
 
     Example:
         >>> network = WeightPerceptron((3, 8, 1), code=4, generator=torch.Generator())

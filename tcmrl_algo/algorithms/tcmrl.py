@@ -24,7 +24,7 @@ from typing import ClassVar, Literal, final
 
 import torch
 from jaxtyping import Bool, Float
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from torch import Tensor, nn
 from torch.nn import functional
 
@@ -57,6 +57,7 @@ from tcmrl_algo.algorithms.core.networks import (
 from tcmrl_algo.algorithms.core.problem import Problem
 from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Windows
+from tcmrl_data.foundation.records import Frozen
 
 TRIED_WEIGHTS = Options((0.0, 0.01, 0.1, 1.0))
 """Of loss terms, beside a weight of 1 for `positive`."""
@@ -65,7 +66,7 @@ ESTIMATOR_WEIGHT = 1.0
 """Of the term `estimator`, the only one that then trains the estimator; Adam is indifferent to its scale."""
 
 
-class Weights(BaseModel):
+class Weights(Frozen):
     """The `[training.tcmrl.weights]` table; a weight of 0 leaves the term out. The paper gives none of them.
 
     Attributes:
@@ -77,8 +78,6 @@ class Weights(BaseModel):
             where it saturates the contexts).
         orthogonality: of the tasks' attention overlap (not in the paper; published code: 1 or 10).
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     positive: float = Field(default=1.0, ge=0)
     negative: float = Field(default=0.1, ge=0)
@@ -146,9 +145,7 @@ class TaskExtractor(nn.Module):
     """The task characteristic extractor, Eq. 2-5: scores transitions against their mean and aggregates them.
 
     Args:
-        latent: size of a representation.
         hidden: widths of q's sigmoid layers (paper, F.2: 256); empty makes q linear, as in the code.
-        generator: draws the start.
     """
 
     def __init__(self, latent: int, *, hidden: Sequence[int], generator: torch.Generator) -> None:
@@ -187,9 +184,6 @@ class RewardEstimator(nn.Module):
     Args:
         inputs: width of what is estimated on: a transition's state and action (Eq. 7 and 8), or those of a
             whole trajectory `side_by_side` (Eq. 17 and 18).
-        latent: size of the context.
-        hidden: widths of the layers.
-        generator: draws the start.
     """
 
     def __init__(
@@ -242,9 +236,7 @@ def reverse_context(
     as long, which is outside of what the reward estimator sees of contexts in L_pos.
 
     Args:
-        representations: c_t.
         weights: attention weights w_t, which sum to 1 over each lane's real steps.
-        mask: real steps; T is their number, lane by lane.
         literal: leave the sum undivided, as printed. Its weights sum to T - 1, so its scale grows with T.
     """
     reverse = where_real(mask, 1.0 - weights, 0.0)
@@ -289,7 +281,6 @@ def task_contrastive_loss(
     Args:
         representations: c_t of the n-th trajectory of every task; windows at equal (n, t) are compared.
         mask: real steps, padding at the end.
-        similarity: W.
         window_length: K > 1. Trajectories shorter than K have no window.
         temperature: divides the logits (not in the paper's Eq. 11; 1 there).
     """

@@ -106,7 +106,6 @@ def task_classification(logits: Float[Tensor, "tasks classes"], positions: Int64
     """Cross-entropy of the training task, -mean log p(task | z): UNICORN-SUP (Li et al., 2024).
 
     Args:
-        logits: of every training task, for every context.
         positions: dense index of the task that a context comes from.
     """
     return functional.cross_entropy(logits, positions)
@@ -114,12 +113,7 @@ def task_classification(logits: Float[Tensor, "tasks classes"], positions: Int64
 
 @final
 class GaussianPerceptron(nn.Module):
-    """Mean and log variance, the latter held between learnt bounds by softplus from either side.
-
-    Args:
-        sizes: width of input, hidden layers and output.
-        generator: draws the start.
-    """
+    """Mean and log variance, the latter held between learnt bounds by softplus from either side."""
 
     def __init__(self, sizes: Sequence[int], *, generator: torch.Generator) -> None:
         super().__init__()

@@ -36,9 +36,7 @@ class LaneStage:
     """Runs one episode per lane, at most MOST_LANES at a time; a lane's seeds are keyed by task and position.
 
     Args:
-        environment: of the tasks.
         seed: under which all seeds of episodes are keyed.
-        reset, noise: purposes of these seeds.
     """
 
     def __init__(self, environment: Environment, *, seed: int, reset: Purpose, noise: Purpose) -> None:
@@ -57,7 +55,6 @@ class LaneStage:
         """One episode per lane; lanes may repeat tasks.
 
         Args:
-            tasks: of the lanes.
             control: the controller of some of the lanes.
             episode: part of the seeds' keys.
             done: called with the number of episodes that ended.
@@ -112,12 +109,9 @@ class Arena:
     """Runs episodes of test tasks, stepped together; every episode has its own keyed seeds.
 
     Args:
-        dataset: the dataset, with its environment, tasks and stored trajectories.
-        algorithm: the trained method.
         settings: the table `[training.run]`.
         capabilities: the method's; whether it needs trajectories, and may observe task parameters.
         seed: the run's seed, from which the seeds of resets, noise and drawn contexts derive.
-        report: called with the stage, the episodes done and their total number, when episodes end.
     """
 
     def __init__(
@@ -144,12 +138,7 @@ class Arena:
         self._stored: dict[int, list[Trajectory]] = {}
 
     def begin(self, stage: str, total: int) -> None:
-        """Starts a stage of progress reports.
-
-        Args:
-            stage: name of the stage.
-            total: number of its episodes.
-        """
+        """Starts a stage of progress reports."""
         self._stage, self._done, self._total = stage, 0, total
 
     def adapted(
@@ -163,9 +152,6 @@ class Arena:
         """One episode per lane, by the policy adapted to the lane's context; lanes may repeat tasks.
 
         Args:
-            tasks: of the lanes.
-            contexts: of the lanes.
-            episode: number of the episode, part of its seeds.
             around: makes the controller that acts from the adapted one.
 
         Raises:

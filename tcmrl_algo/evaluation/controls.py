@@ -13,7 +13,6 @@ from typing import Any, Literal, final
 
 import numpy as np
 import numpy.typing as npt
-from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.algorithms.core.problem import SMALLEST_STD, numbers
 from tcmrl_algo.evaluation.arena import LaneStage, ProgressCallback, ignore_progress
@@ -32,15 +31,11 @@ from tcmrl_data import (
 from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import make_folders
 from tcmrl_data.foundation.errors import StorageError
-from tcmrl_data.foundation.records import read_record, write_record
+from tcmrl_data.foundation.records import Frozen, read_record, write_record
 from tcmrl_data.foundation.seeding import evenly_spread
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class FixedSnapshot(_Record):
+class FixedSnapshot(Frozen):
     """The training task's last policy that does best in all training tasks.
 
     Attributes:
@@ -59,7 +54,7 @@ class FixedSnapshot(_Record):
     average_return: float
 
 
-class FixedTarget(_Record):
+class FixedTarget(Frozen):
     """The task parameters whose oracle does best in all training tasks.
 
     Attributes:
@@ -71,7 +66,7 @@ class FixedTarget(_Record):
     train_return: float
 
 
-class TaskControls(_Record):
+class TaskControls(Frozen):
     """Returns in one test task, all undiscounted means; None for what the environment or dataset lacks.
 
     Attributes:
@@ -94,7 +89,7 @@ class TaskControls(_Record):
     fixed: float | None
 
 
-class Controls(_Record):
+class Controls(Frozen):
     """What adaptation is compared with on a dataset; the document of `tcmrl controls --json`.
 
     The fixed policies are fitted on the training tasks and act the same in every task. A behavior policy that
@@ -146,7 +141,6 @@ def best_target(
     share stay what they are.
 
     Args:
-        tasks: on which the parameters are fitted.
         mean_return: the mean over the tasks of the returns of the oracle for given parameters.
     """
     from scipy.optimize import minimize
@@ -197,12 +191,7 @@ Control = Callable[[Sequence[Task]], Controller]
 
 @final
 class ControlBench:
-    """Runs policies in the tasks of a dataset.
-
-    Args:
-        dataset: with its environment, tasks and stored policies.
-        report: called with the stage, the episodes done and their total number.
-    """
+    """Runs policies in the tasks of a dataset."""
 
     def __init__(self, dataset: Dataset, report: ProgressCallback) -> None:
         self.dataset, self._report = dataset, report
@@ -346,10 +335,6 @@ def dataset_controls(dataset: Dataset, *, report: ProgressCallback = ignore_prog
     """The controls of a dataset, measured if they were not before.
 
     Where the cache cannot be written they are measured every time.
-
-    Args:
-        dataset: with complete test tasks.
-        report: called with the stage, the episodes done and their total number.
 
     Raises:
         TrainingError: the dataset has no training or no test task.

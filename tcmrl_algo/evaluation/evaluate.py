@@ -125,9 +125,7 @@ class PathPlot:
     """Draws a final episode of every test task, and beside it one under another task's context.
 
     Args:
-        file: picture to write.
         dataset: with environment and tasks.
-        settings: of the evaluation, for the titles.
 
     Raises:
         RenderingError: the environment's paths cannot be drawn, or the file's ending is not known.
@@ -185,14 +183,11 @@ def evaluate_run(
     """Evaluates the newest checkpoint of a run, and logs the means in the folder of the run.
 
     Args:
-        run_folder: folder of a run of `tcmrl train`.
         protocol: replaces the protocol of the run.
         dataset_path: folder of the run's dataset, if the dataset was moved.
         episodes: replaces the number of adaptation episodes per task of the run.
         random_episodes: replaces `run.random_episodes`, how many of them form the first stage.
         repeats: replaces `run.repeats`, how many times a protocol with a random first stage is run.
-        plot: picture to write, of the paths of the adapted policy in the test tasks.
-        report: called when episodes end.
 
     Raises:
         CheckpointError: no run, no checkpoint, or not the dataset that the run was trained on.
@@ -242,10 +237,7 @@ def evaluate_open_run(
     """As `evaluate_run`, for an open run and dataset.
 
     Args:
-        run: the run.
-        dataset: its dataset.
         settings: may differ from those of the run.
-        report: called when episodes end.
         show: called with the final episodes of all tasks.
     """
     protocol = PROTOCOLS.get(settings.protocol)()

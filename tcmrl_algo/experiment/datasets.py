@@ -43,7 +43,6 @@ def missing_datasets(experiment: Experiment, data: Path) -> list[MissingDataset]
     """The datasets of an experiment that do not exist.
 
     Args:
-        experiment: the experiment.
         data: folder of datasets, one per environment; or one dataset.
     """
     return [
@@ -56,17 +55,7 @@ def missing_datasets(experiment: Experiment, data: Path) -> list[MissingDataset]
 def build_missing(
     missing: MissingDataset, *, workers: int | None, report: Callable[[BuildEvent], None]
 ) -> None:
-    """Builds a dataset that an experiment needs; a build that was stopped goes on.
-
-    Args:
-        missing: the dataset.
-        workers: processes; one per core where None.
-        report: called as the build proceeds.
-
-    Raises:
-        TcmrlError: it cannot be built.
-        TrainingError: some of its parts failed.
-    """
+    """Builds a dataset that an experiment needs; a build that was stopped goes on."""
     recipe = load_recipe(missing.environment, profile=missing.profile)
     built = build_dataset(recipe, missing.folder, workers=workers, progress=report)
     if built.failed:
@@ -98,9 +87,7 @@ def fold_datasets(dataset: Dataset, views: Path, folds: int | None) -> dict[int 
     """Views of a dataset by fold, in which that fold of the tasks is the test split; itself without folds.
 
     Args:
-        dataset: the dataset.
         views: folder in which one view file per fold is made, unless it is there.
-        folds: number of folds.
 
     Raises:
         SelectionError: so many folds that a split would lack tasks.

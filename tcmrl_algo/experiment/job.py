@@ -45,11 +45,7 @@ MEANS = ("final", "regret", "normalized", "shuffled")
 
 
 def finished_trainings(folders: Iterable[str | Path]) -> list[RunResult]:
-    """The finished runs in results folders that still have their tensors.
-
-    Raises:
-        CheckpointError: no experiment was run in one of the folders.
-    """
+    """The finished runs in results folders that still have their tensors."""
     return [
         result.model_copy(update={"identity": completed(result.identity)})
         for folder in map(Path, folders)

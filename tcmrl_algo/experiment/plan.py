@@ -35,7 +35,6 @@ def plan_runs(
     """Every run, all methods under one seed before the next seed.
 
     Args:
-        experiment: the file.
         data: folder of datasets, one per environment; or one dataset, whatever the file says of its place.
         out: the results folder. View files of folds are written there, after all else was checked.
         environments: instead of all of the experiment's.
@@ -44,7 +43,6 @@ def plan_runs(
         overrides: `section.key=value` texts for all runs, which the experiment's own changes go over.
         tuned: settings of environments and algorithms, which methods' own changes go over; the training
             table's for what it does not have, or where None.
-        threads, device: of every run.
 
     Raises:
         SelectionError: a dataset is missing, of another environment or profile, without test tasks, or

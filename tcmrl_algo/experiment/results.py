@@ -11,13 +11,13 @@ from pathlib import Path
 from types import UnionType
 from typing import Any, Literal, TypeVar, get_args, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
 from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_algo.experiment.spec import Experiment, run_id
 from tcmrl_data import CheckpointError
 from tcmrl_data.foundation.disk import make_folders, replace_file
-from tcmrl_data.foundation.records import read_record
+from tcmrl_data.foundation.records import Frozen, read_record
 
 COLUMNS = (
     "environment",
@@ -49,11 +49,7 @@ YES = "yes"
 Row = TypeVar("Row")
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class CurvePoint(_Record):
+class CurvePoint(Frozen):
     """One point of a learning curve, and what it took to get there.
 
     Attributes:
@@ -80,7 +76,7 @@ class CurvePoint(_Record):
     device_memory: int
 
 
-class Tuned(_Record):
+class Tuned(Frozen):
     """The best settings of a tuning, and what it took to find them.
 
     Attributes:
@@ -104,7 +100,7 @@ TunedSettings = Mapping[str, Mapping[str, Tuned]]
 """Tuned settings by environment and algorithm."""
 
 
-class ContextMeasures(_Record):
+class ContextMeasures(Frozen):
     """What a report measures of a run's contexts and attention; it needs the checkpoint and the dataset.
 
     Attributes:
@@ -126,13 +122,13 @@ class ContextMeasures(_Record):
     median_nonzero: float | None = None
 
 
-class Curve(_Record):
+class Curve(Frozen):
     """`curve.json` in a run's folder: the points so far."""
 
     points: tuple[CurvePoint, ...] = ()
 
 
-class SharedTraining(_Record):
+class SharedTraining(Frozen):
     """What a run takes over from a finished one of equal training.
 
     Attributes:
@@ -144,10 +140,10 @@ class SharedTraining(_Record):
     training_of: str
     training_seconds: float | None
     peak_memory: int | None
-    evaluations: dict[str, dict[str, Any]] = {}
+    evaluations: dict[str, dict[str, Any]] = Field(default={})
 
 
-class RunSpec(_Record):
+class RunSpec(Frozen):
     """Which run: a method on a dataset with a seed, and all settings.
 
     Attributes:

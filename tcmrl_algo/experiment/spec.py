@@ -9,12 +9,12 @@ from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
 from tcmrl_data import CheckpointError, Profile, TrainingError
 from tcmrl_data.foundation.canonical import leaves, parse_json
 from tcmrl_data.foundation.plugins import unknown_name
-from tcmrl_data.foundation.records import validate_table
+from tcmrl_data.foundation.records import Frozen, validate_table
 
 Metric = Literal[
     "final",
@@ -38,11 +38,7 @@ LIKE = "like"
 """The key of a file that names another file, whose keys it takes where it has none."""
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class EnvironmentChoice(_Table):
+class EnvironmentChoice(Frozen):
     """One `[environments.NAME]` table.
 
     Attributes:
@@ -57,11 +53,11 @@ class EnvironmentChoice(_Table):
     dataset: str | None = None
     dataset_profile: Profile | None = None
     profile: str | None = None
-    training: dict[str, Any] = {}
+    training: dict[str, Any] = Field(default={})
     tuning: str | None = None
 
 
-class MethodChoice(_Table):
+class MethodChoice(Frozen):
     """One `[methods.LABEL]` table.
 
     Attributes:
@@ -71,7 +67,7 @@ class MethodChoice(_Table):
     """
 
     algorithm: str
-    training: dict[str, Any] = {}
+    training: dict[str, Any] = Field(default={})
     environments: tuple[str, ...] = ()
 
     def runs_in(self, environment: str) -> bool:
@@ -79,7 +75,7 @@ class MethodChoice(_Table):
         return not self.environments or environment in self.environments
 
 
-class Claim(_Table):
+class Claim(Frozen):
     """One `[[claims]]` table: that one quantity is better than another, seed by seed.
 
     Attributes:
@@ -103,7 +99,7 @@ class Claim(_Table):
     registered: str | None = None
 
 
-class Experiment(_Table):
+class Experiment(Frozen):
     """A whole experiment file.
 
     Attributes:
@@ -129,7 +125,7 @@ class Experiment(_Table):
     folds: int | None = Field(default=None, ge=2)
     environments: dict[str, EnvironmentChoice] = Field(min_length=1)
     methods: dict[str, MethodChoice] = Field(min_length=1)
-    training: dict[str, Any] = {}
+    training: dict[str, Any] = Field(default={})
     protocols: tuple[str, ...] = Field(default=PAPER_PROTOCOLS, min_length=1)
     curve_points: int = Field(default=5, ge=1)
     claims: tuple[Claim, ...] = ()

@@ -113,7 +113,6 @@ def tune_method(
     `trials` is larger; the result is that of one uninterrupted call, whatever `workers` is.
 
     Args:
-        dataset: what to learn from.
         out: the folder, made where it does not exist.
         algorithm: the method; its `search` says what is searched.
         trials: how many, the first included. Compare methods by equal numbers.
@@ -122,12 +121,9 @@ def tune_method(
         seeds: every trial is trained with each.
         seed: of the proposals.
         held_out: training tasks to score on; a fifth of them, evenly spaced, if None.
-        protocols: of evaluation.
         overrides: `section.key=value` texts that all trials share; what they set is not searched.
         workers: runs at a time, which share the cores as threads; one per core if None.
-        device: a torch device.
         engine: what runs them, by name or made before; `workers` says how the cores are shared either way.
-        report: called as trials end.
 
     Raises:
         SelectionError: too few training tasks, or held-out tasks that are none.
@@ -226,11 +222,7 @@ def plan_tuning(
     protocols: Sequence[str],
     overrides: Sequence[str],
 ) -> Tuning:
-    """The record of `tune_method`, whose arguments these are, without trials.
-
-    Raises:
-        TcmrlError: as of `tune_method`.
-    """
+    """The record of `tune_method`, whose arguments these are, without trials."""
     texts = (*overrides, *([] if steps is None else [f"run.steps={steps}"]))
     config = resolve_for(dataset, profile=profile, algorithm=algorithm, overrides=texts)
     for what, given in (("seeds", seeds), ("protocols", protocols)):
@@ -345,11 +337,7 @@ def _trial_run(result: RunResult) -> TrialRun:
 
 
 def _continued(planned: Tuning, out: Path) -> Tuning:
-    """The record in a folder, or a new one without trials.
-
-    Raises:
-        CheckpointError: it is of other settings or data.
-    """
+    """The record in a folder, or a new one without trials."""
     if not (out / RECORD).is_file():
         return planned
     before = read_tuning(out)
@@ -454,11 +442,9 @@ def propose(
     known trials anew every time, so that nothing but their records need be kept.
 
     Args:
-        space: what is searched.
         known: ended trials; one that diverged counts as worse than all others.
         number: of the trial.
         seed: of all proposals.
-        environment: its name; part of every seed's key.
 
     Raises:
         MissingPackageError: Optuna is not installed.

@@ -6,25 +6,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict
-
 from tcmrl_algo.algorithms.core.method import METHODS, Factors, Search, SettingValue
 from tcmrl_algo.algorithms.core.settings import UNREAD, ActorCriticSettings, TrainingConfig
 from tcmrl_algo.experiment.results import Tuned, read_table
 from tcmrl_algo.experiment.spec import Experiment, override_texts
 from tcmrl_data import Profile, TrainingError, apply_overrides
-from tcmrl_data.foundation.records import read_record
+from tcmrl_data.foundation.records import Frozen, read_record
 
 RECORD, TABLE = "tuning.json", "tuning.csv"
 SIGNIFICANT_DIGITS = 3
 """Of values that a factor gives: more would only make overrides longer."""
 
 
-class _Record(BaseModel):
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-
-class Dimension(_Record):
+class Dimension(Frozen):
     """One searched setting.
 
     Attributes:
@@ -54,7 +48,7 @@ class Dimension(_Record):
         return float(f"{float(self.own) * float(drawn):.{SIGNIFICANT_DIGITS}g}")
 
 
-class TrialRun(_Record):
+class TrialRun(Frozen):
     """A trial's run with one seed.
 
     Attributes:
@@ -70,7 +64,7 @@ class TrialRun(_Record):
     digest: str
 
 
-class Trial(_Record):
+class Trial(Frozen):
     """One choice of settings, trained once per seed.
 
     Attributes:
@@ -101,7 +95,7 @@ class Trial(_Record):
         return tuple(override_texts(self.values))
 
 
-class Tuning(_Record):
+class Tuning(Frozen):
     """`tuning.json`: everything that tuning did and on what.
 
     Attributes:
@@ -327,8 +321,6 @@ def searched(search: Search, overrides: Sequence[str], *, kind: str | None = Non
     """The search without what an override gives a value, or the chosen actor-critic does not read.
 
     Args:
-        search: of a method.
-        overrides: `section.key=value` texts.
         kind: of the actor-critic; the one that the overrides choose, else the default, where None.
     """
     chosen = apply_overrides({}, overrides).get("actor_critic", {})

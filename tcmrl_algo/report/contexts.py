@@ -70,15 +70,8 @@ class Stored:
 class TrainedContexts:
     """Contexts and attention of one finished run.
 
-    Args:
-        run: the run; its newest checkpoint is read.
-        stored: trajectories of the dataset that the run was trained on.
-
     Attributes:
         labels: (trajectories,), task of every trajectory, as an index into the stored tasks.
-
-    Raises:
-        CheckpointError: the run has no checkpoint, or another dataset.
     """
 
     def __init__(self, run: RunResult, stored: Stored) -> None:

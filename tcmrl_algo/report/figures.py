@@ -76,13 +76,7 @@ def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
 
 
 def draw_board(file: Path, title: str, board: Mapping[str, Mapping[str, Sequence[float]]]) -> None:
-    """Mean returns with intervals, a line per method and a color per protocol.
-
-    Args:
-        file: the PNG file.
-        title: of the panel.
-        board: returns of the runs by protocol and method.
-    """
+    """Mean returns with intervals, a line per method and a color per protocol."""
     methods = list(dict.fromkeys(method for found in board.values() for method in found))[::-1]
     figure, (axes,) = _panels(1, width=1.5 * WIDTH, height=max(HEIGHT, 0.35 * len(methods) + 1.0))
     for index, (protocol, found) in enumerate(board.items()):

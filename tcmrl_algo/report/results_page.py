@@ -209,8 +209,6 @@ class Numbers:
         """All methods of an experiment in an environment, with the returns that one compares them with.
 
         Args:
-            experiment: its name.
-            environment: name of the environment.
             protocols: columns; all where empty. Methods are sorted by the first.
             compared: a method whose returns minus each other method's have a column, by the first protocol.
 
@@ -315,11 +313,7 @@ def read_numbers(file: Path) -> Numbers:
 
 
 def page_of(file: Path, numbers: Numbers) -> str:
-    """The page of a table, by its template.
-
-    Raises:
-        TrainingError: the template asks for what the tables do not hold.
-    """
+    """The page of a table, by its template."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader([file.parent, Path(__file__).parent]),
         undefined=jinja2.StrictUndefined,
@@ -340,7 +334,6 @@ def write_results_page(file: str | Path, out: str | Path | None = None) -> list[
     """Writes the page of a table of runs, and its pictures; the files.
 
     Args:
-        file: the table, `runs.csv`.
         out: folder of the page; the table's own where None.
 
     Raises:

@@ -221,13 +221,7 @@ def add_worth(file: Path, documents: Sequence[Path]) -> list[WorthRow]:
 
 
 def run_rows(experiment: str, result: RunResult, stored: DatasetReturns | None) -> list[RunRow]:
-    """Rows of a run, one per protocol.
-
-    Args:
-        experiment: its name in the table.
-        result: of the run.
-        stored: what is known of the dataset.
-    """
+    """Rows of a run, one per protocol."""
     result = result.compact()
     known = stored if stored is not None and stored.root == result.root else None
     settings, tuned = result.config.settings, result.tuned

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
 
 from tcmrl_algo.evaluation.evaluate import evaluate_run
 from tcmrl_algo.evaluation.protocols.base import PROTOCOLS
@@ -25,10 +24,10 @@ from tcmrl_algo.experiment.spec import Experiment, experiment_of, folder_name, r
 from tcmrl_algo.report.contexts import FloatArray, IntArray, Trained, TransitionWeights
 from tcmrl_algo.training.checkpoint import Run, open_run, tensors_digest
 from tcmrl_data import CheckpointError, Dataset, TcmrlError, canonical_json, list_returns, open_dataset
-from tcmrl_data.foundation.records import read_record
+from tcmrl_data.foundation.records import Frozen, read_record
 
 
-class SnapshotReturns(BaseModel):
+class SnapshotReturns(Frozen):
     """Mean returns of the stored episodes of one snapshot, over tasks.
 
     Attributes:
@@ -36,14 +35,12 @@ class SnapshotReturns(BaseModel):
         train, test: mean over training and over test tasks; None where there is no such snapshot.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     step: int | None
     train: float | None
     test: float | None
 
 
-class DatasetReturns(BaseModel):
+class DatasetReturns(Frozen):
     """`datasets/ENVIRONMENT.json` of a report: what was stored in the dataset of an environment.
 
     Attributes:
@@ -51,8 +48,6 @@ class DatasetReturns(BaseModel):
         train_tasks, test_tasks: number of tasks.
         snapshots: by ascending step, and last all together.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     environment: str
     root: str

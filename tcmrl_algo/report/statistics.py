@@ -184,7 +184,6 @@ def known_scores(results: Sequence[RunResult], stored: float | None) -> dict[str
     """The scores that some run has, by the names of their columns.
 
     Args:
-        results: of the runs.
         stored: mean return of the stored episodes of the test tasks; None where unknown.
     """
     scores: dict[str, Score] = {"success": success_rate, "over dataset": partial(over_dataset, stored=stored)}
@@ -287,9 +286,6 @@ def compare(claim: Claim, environment: str, results: Sequence[RunResult], *, pro
     """The comparison that a claim asks for; `correct` decides what it says.
 
     Args:
-        claim: the claim.
-        environment: name of the environment.
-        results: of the runs in the environment.
         protocol: the protocol; None for metrics that do not depend on it.
     """
     against = claim.against or claim.metric

@@ -75,8 +75,6 @@ def final_table(name: str, results: Sequence[RunResult], *, stored: float | None
     Success rate and return over the dataset's have columns where they are known.
 
     Args:
-        name: of the CSV file.
-        results: of the runs in one environment.
         stored: mean return of the stored episodes of the test tasks.
     """
     rows: list[tuple[Cell, ...]] = []

@@ -152,7 +152,6 @@ def write_report(
         out: folder of the report, created if needed; files of an earlier report are replaced.
         datasets: folders of datasets that were moved after the training of the runs.
         rows: a table, `runs.csv`, to which the runs of results folders are added.
-        report: called as the work proceeds.
 
     Raises:
         CheckpointError: not a results or run folder, no finished run in it, a dataset of no run, or `rows`
@@ -192,11 +191,7 @@ def measure_paths(
     datasets: Sequence[str | Path] = (),
     report: ReportProgress | None = None,
 ) -> list[tuple[str, Source]]:
-    """The experiments in folders with compact results, by unique names, in natural order.
-
-    Raises:
-        CheckpointError: as `write_report`.
-    """
+    """The experiments in folders with compact results, by unique names, in natural order."""
     sources = read_sources(
         [Path(path) for path in paths], report, datasets=[Path(folder) for folder in datasets]
     )
@@ -217,7 +212,6 @@ def compose(sources: Sequence[tuple[str, Source]], out: Path) -> tuple[Page, dic
 
     Args:
         sources: the experiments under the names that their files and sections get.
-        out: folder of the report.
     """
     page = Page(out)
     page.text(f"# Report: {', '.join(name for name, _ in sources)}")
@@ -352,11 +346,7 @@ def _add_dataset(page: Page, name: str, environment: str, source: Source) -> Non
 
 
 def page_html(page: Page) -> str:
-    """The content of `report.html`: the Markdown, with the figures of the page's folder in it.
-
-    Raises:
-        OSError: a figure was not drawn.
-    """
+    """The content of `report.html`: the Markdown, with the figures of the page's folder in it."""
     markdown = MarkdownIt("zero").enable(["heading", "table", "backticks", "escape", "image", "link"])
     # Links may lead to files beside the report alone.
     setattr(markdown, "validateLink", lambda url: re.fullmatch(r"[\w.-]+", url) is not None)  # noqa: B010

@@ -56,13 +56,8 @@ def open_batches(
     """The stream of batches from the training tasks; the steps of the selections are loaded once.
 
     Args:
-        dataset: what to learn from.
         run: `snapshots` and `context_snapshots` say which.
         stages: what the batches of every stage hold.
-        seed: of the run.
-        device: where batches are to be.
-        memory_limit: as for `train_run`.
-        say: as for `train_run`.
     """
 
     def sampler(snapshots: str, request: BatchRequest) -> Sampler:
@@ -95,7 +90,6 @@ class JoinedBatches:
     """Transitions from one sampler; trajectories and windows from another.
 
     Args:
-        transitions: where kinds of transitions come from.
         contexts: where all other kinds come from; of the same seed and tasks.
     """
 
@@ -127,12 +121,7 @@ class JoinedBatches:
 
 @final
 class StagedBatches:
-    """The batches of a run: batch n is for training step n + 1, and holds what that step's stage requests.
-
-    Args:
-        batches: of the first stage.
-        stages: all of them.
-    """
+    """The batches of a run: batch n is for training step n + 1, and holds what that step's stage requests."""
 
     def __init__(self, batches: Batches, stages: StagePlan) -> None:
         self._batches, self._stages = batches, stages

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal, final
 
 import safetensors.torch
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 from safetensors import SafetensorError
 from torch import Tensor
 
@@ -17,7 +17,7 @@ from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_data import CheckpointError, Dataset, open_dataset
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import make_folders, publish_folder, remove_abandoned, remove_tree
-from tcmrl_data.foundation.records import read_record, record_bytes, write_record
+from tcmrl_data.foundation.records import Frozen, read_record, record_bytes, write_record
 
 EVALUATIONS = "evaluations.jsonl"
 """In the folder of a run: a line of means for every evaluation."""
@@ -26,7 +26,7 @@ KEPT = 2
 """Newest checkpoints kept: the last one, and one to fall back on."""
 
 
-class RunRecord(BaseModel):
+class RunRecord(Frozen):
     """`run.json`: everything a run is a function of, beside the code.
 
     Attributes:
@@ -44,8 +44,6 @@ class RunRecord(BaseModel):
         versions: packages that results depend on.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     schema_version: Literal[1] = 1
     environment: str
     dataset: str
@@ -60,13 +58,11 @@ class RunRecord(BaseModel):
     versions: dict[str, str]
 
 
-class CheckpointRecord(BaseModel):
+class CheckpointRecord(Frozen):
     """`checkpoint.json`: the step, and the digest of the tensors beside it.
 
     No generator state is kept: randomness of every step is a function of the run's seed and the step.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     schema_version: Literal[1] = 1
     step: int = Field(ge=0)

@@ -28,7 +28,6 @@ def resolve(
     """The run that a recipe's training table describes.
 
     Args:
-        table: `[training]` of one profile.
         place: names the table's origin in errors.
         algorithm: instead of the table's `run.algorithm`.
         overrides: `section.key=value` texts, applied last.
@@ -75,12 +74,6 @@ def resolve_for(
     A method that is newer than the dataset has no table there. It gets the one of the installed recipe of
     the same environment and profile, where there is one, and its own defaults otherwise;
     `TrainingConfig.training_source` says which.
-
-    Args:
-        dataset: what to train on.
-        profile: whose training table.
-        algorithm: instead of the table's.
-        overrides: as of `resolve`.
 
     Raises:
         TrainingError: no such profile, or as of `resolve`.
@@ -135,11 +128,7 @@ def stage_plan(config: TrainingConfig) -> StagePlan:
 
 
 def _check_names(tables: Mapping[str, Any], place: str) -> None:
-    """Every remaining table must be named after an algorithm.
-
-    Raises:
-        TrainingError: the first that is not.
-    """
+    """Every remaining table must be named after an algorithm."""
     for name in sorted(set(tables) - set(METHODS.names())):
         known = ", ".join(TrainingSettings.model_fields)
         raise TrainingError(

@@ -53,9 +53,6 @@ def log_evaluation(folder: Path, *, step: int, protocol: str, scores: Mapping[st
     A run that cannot be written to, such as one on a shared disk, is evaluated all the same.
 
     Args:
-        folder: the run's.
-        step: of the checkpoint that was evaluated.
-        protocol: by which it was adapted.
         scores: by name; None where there is none.
     """
     with contextlib.suppress(OSError):
@@ -72,7 +69,6 @@ class MetricsWriter:
     """Appends to `metrics.jsonl` and `tensorboard/` in a run's folder.
 
     Args:
-        folder: the run's.
         step: the checkpoint's step that training goes on from; what a killed run logged beyond it is dropped.
     """
 
@@ -182,11 +178,8 @@ def train_run(
     Args:
         dataset: what to learn from; only its training tasks are used.
         out: the run's folder, made here.
-        config: the resolved training table.
         profile: whose table it was; recorded.
-        seed: of everything random.
         steps: where to stop, instead of `run.steps`; schedules keep the length that `run.steps` gives them.
-        device: a torch device.
         memory_limit: bytes of data beyond which the cache is used; half of the available memory if None.
         report: called after every logged step.
         say: told where data are read from, where that is not memory.
@@ -255,12 +248,8 @@ def resume_run(
     A run that was killed before its first checkpoint begins anew.
 
     Args:
-        out: the run's folder.
-        dataset: the one it was trained on.
         steps: another place to stop.
         device: another device.
-        memory_limit: as for `train_run`.
-        report: called after every logged step.
         say: told from which step training goes on; otherwise as for `train_run`.
 
     Raises:
@@ -292,11 +281,7 @@ def resume_run(
 
 
 def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
-    """A run's algorithm with its networks at their start, for training or for a checkpoint's tensors.
-
-    Raises:
-        TrainingError: an unusable device.
-    """
+    """A run's algorithm with its networks at their start, for training or for a checkpoint's tensors."""
     settings = record.config.settings
     torch.set_num_threads(settings.run.threads)
     method, config = method_of(record.config)
@@ -373,11 +358,7 @@ def _train(
 
 
 def _check_sizes(metrics: Mapping[str, Tensor], limits: Mapping[str, float], step: int) -> None:
-    """Stops training where a metric is NaN or beyond its limit, one synchronisation for all of them.
-
-    Raises:
-        DivergenceError: with the first such metric, its value, its limit and the step.
-    """
+    """Stops training where a metric is NaN or beyond its limit, one synchronisation for all of them."""
     largest = [limits.get(name, sys.float_info.max) for name in metrics]
     sizes = torch.stack([*metrics.values()]).double().abs().tolist()
     for name, size, limit in zip(metrics, sizes, largest, strict=True):
@@ -387,11 +368,7 @@ def _check_sizes(metrics: Mapping[str, Tensor], limits: Mapping[str, float], ste
 
 
 def _check_finite(values: Mapping[str, Tensor], step: int) -> None:
-    """Stops training where a tensor holds NaN or infinity, one synchronisation for all of them.
-
-    Raises:
-        DivergenceError: with the first such quantity and the step.
-    """
+    """Stops training where a tensor holds NaN or infinity, one synchronisation for all of them."""
     bad = [torch.isfinite(value).all() for value in values.values()]
     if bool(torch.stack(bad).all()):
         return

@@ -24,10 +24,16 @@ SMALL_RECORD = 2**16
 """Bytes of JSON up to which a record is validated once, whatever its errors cost; most parts' are 10 kB."""
 
 
-class Record(BaseModel):
-    """A record of a dataset: frozen; unknown keys, type conversions and NaN are errors."""
+class Frozen(BaseModel):
+    """Settings, or a record: frozen; unknown keys are errors."""
 
-    model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+
+class Record(Frozen):
+    """A record of a dataset: type conversions and NaN are errors, too."""
+
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
 
 Kind = TypeVar("Kind", bound=BaseModel)

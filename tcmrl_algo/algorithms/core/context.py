@@ -98,12 +98,7 @@ def transition_scaling(problem: Problem) -> Standardizer:
 
 
 def read_steps(steps: Steps, scaling: Standardizer) -> EncoderInputs:
-    """The steps in units of the data's standard deviations.
-
-    Args:
-        steps: (tasks, trajectories, steps).
-        scaling: of `transition_scaling`.
-    """
+    """The steps in units of the data's standard deviations."""
     changes = steps.next_observations - steps.observations
     inputs = torch.cat([steps.observations, steps.actions, steps.rewards.unsqueeze(-1), changes], dim=-1)
     state_action = steps.observations.shape[-1] + steps.actions.shape[-1]
@@ -116,12 +111,6 @@ class ContextEncoder(nn.Module):
 
     Deviation: the encoder reads s_{t+1} - s_t in place of s_{t+1}; the two carry the same information,
     and the difference keeps its scale where states move little in one step.
-
-    Args:
-        problem: sizes and moments of the data.
-        latent: size of a representation.
-        hidden: widths of the layers.
-        generator: draws the start.
     """
 
     def __init__(
@@ -224,14 +213,7 @@ KINDS: dict[str, Kind] = {"sac": SoftActorCritic, "iql": ImplicitQLearning, "bc"
 def make_actor_critic(
     settings: ActorCriticSettings, problem: Problem, *, latent: int, generator: torch.Generator
 ) -> ActorCritic:
-    """A new actor-critic of `settings.kind`.
-
-    Args:
-        settings: the resolved table.
-        problem: sizes and moments of the data.
-        latent: size of the context; 0 makes everything blind to the task.
-        generator: draws the starts.
-    """
+    """A new actor-critic of `settings.kind`."""
     return KINDS[settings.kind](settings, problem, latent=latent, generator=generator)
 
 
@@ -240,8 +222,6 @@ class ContextAlgorithm(Algorithm):
     """A context learner and the actor-critic that its contexts condition, trained side by side.
 
     Args:
-        problem: what is learned from.
-        settings: the shared tables.
         learner: makes and trains contexts; its draws are those of stream 0.
     """
 

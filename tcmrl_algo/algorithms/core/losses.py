@@ -47,7 +47,6 @@ def info_nce(
         queries: z^q of every task at every position.
         keys: z^k of every task at every position; the one of the same task matches.
         mask: which tasks exist at a position. The others are in no denominator there.
-        temperature: tau.
     """
     # contiguous, mask included: otherwise products fall back to one small product per position
     queries, keys, mask = queries.contiguous(), keys.contiguous(), mask.contiguous()
@@ -76,9 +75,7 @@ def distance_metric_loss(
     TCMRL, whose paper has no such loss, attract by sqrt(d^2 + 0.001), which near contexts feel more.
 
     Args:
-        contexts: several contexts of every task.
         epsilon: bounds the repulsion (published code: 0.1).
-        attraction: `square`, d^2, or `root`, sqrt(d^2 + 0.001).
     """
     flat = contexts.flatten(0, 1)
     squares = (flat.unsqueeze(0) - flat.unsqueeze(1)).square().mean(dim=-1)
@@ -124,10 +121,8 @@ def q_loss(
 
     Args:
         q_values: Q of each critic for the stored actions.
-        rewards: scaled rewards.
         terminated: d, 1 where the task ended the episode; a time limit is 0.
         next_values: V(s', c) of the target network; no gradient reaches it.
-        gamma: discount factor.
     """
     targets = (rewards + gamma * (1.0 - terminated) * next_values).detach()
     return (q_values - targets).square().mean(dim=-1).sum()

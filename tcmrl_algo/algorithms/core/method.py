@@ -8,7 +8,6 @@ from typing import Any, ClassVar, Generic, TypeVar
 import numpy as np
 import torch
 from jaxtyping import Float
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor, nn
 
 from tcmrl_algo.algorithms.core.optimizer import Adam, ParameterGroup, StagedOptimizer
@@ -16,6 +15,7 @@ from tcmrl_algo.algorithms.core.problem import Problem, Stage
 from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Controller, Trajectory, UniformController
 from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.foundation.records import Frozen
 
 ConfigT = TypeVar("ConfigT", bound="MethodConfig")
 
@@ -59,10 +59,8 @@ SHARED_SEARCH: Search = {
 """What all methods search that train the shared actor-critic, by equal ranges; a method may add to it."""
 
 
-class MethodConfig(BaseModel):
+class MethodConfig(Frozen):
     """A method's own settings, `[training.<name>]`: none, or the fields of a subclass."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
 
 @dataclass(frozen=True)
@@ -95,8 +93,6 @@ class Algorithm(abc.ABC):
     evaluation know no more of a method than this class and its `Method`.
 
     Args:
-        problem: what is learned from.
-        settings: the shared tables.
         networks: everything that is trained; moved to the problem's device.
         parts: what a stage trains, as of `StagedOptimizer`.
         groups: learning rates and bounds of their own, as of `StagedOptimizer`.
@@ -128,7 +124,6 @@ class Algorithm(abc.ABC):
         """The loss of the networks in a step, and the metrics of the step.
 
         Args:
-            batch: holds what the step's stage requested.
             step: counted from 1 over all stages; `Problem.stages` tells the stage.
         """
 
@@ -198,7 +193,6 @@ class FunctionController(Controller):
     Args:
         policy: actions (lanes, action_dim) in [-1, 1] for observations (lanes, observation_dim); called
             without gradients.
-        device: where the function reads observations.
     """
 
     def __init__(self, policy: Callable[[Tensor], Tensor], device: torch.device) -> None:

@@ -56,7 +56,6 @@ class Perceptron(nn.Module):
     Args:
         sizes: width of input, hidden layers and output; two entries make one linear layer.
         activation: between layers, not after the last; it may work in place, which spares a pass over memory.
-        generator: draws the start.
 
     Attributes:
         hidden_dtype: in which the hidden layers multiply; parameters, the last layer and all losses stay
@@ -101,9 +100,7 @@ class PerceptronEnsemble(nn.Module):
     One product per member and layer: on a CPU the batched product of all members is slower.
 
     Args:
-        members: how many.
         sizes: width of input and hidden layers.
-        generator: draws the start.
     """
 
     def __init__(self, members: int, sizes: Sequence[int], *, generator: torch.Generator) -> None:

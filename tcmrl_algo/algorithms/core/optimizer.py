@@ -40,7 +40,6 @@ class Adam:
 
     Args:
         parameters: as of `Module.named_parameters`; those without a gradient are left out.
-        learning_rate: at the first step.
         final_share: share of it at and after `decay_steps`; the rate falls linearly until then.
         decay_steps: length of the decay.
         gradient_norm: gradients above this norm are scaled down to it; None leaves them.
@@ -156,9 +155,7 @@ class StagedOptimizer:
     """One Adam per stage over the parameters that the stage trains; all others are frozen meanwhile.
 
     Args:
-        module: holds everything that is trained.
         stages: the run's; the learning rate decays anew over every stage.
-        settings: `[training.optimizer]`.
         parts: what a stage trains, by its name: names of parameters, or of modules above them. A stage that
             is missing trains everything.
         groups: rates and bounds of their own, as of `Adam`, in the stages that train them.

@@ -7,7 +7,6 @@ from typing import Any, Literal, NamedTuple, final
 import numpy as np
 import torch
 from jaxtyping import Float, Int64
-from pydantic import BaseModel, ConfigDict
 from torch import Tensor
 
 from tcmrl_data import (
@@ -22,6 +21,7 @@ from tcmrl_data import (
     Trajectory,
     keyed_seed,
 )
+from tcmrl_data.foundation.records import Frozen
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,6 @@ class StagePosition(NamedTuple):
 @final
 class StagePlan:
     """The stages of a run, one after the other.
-
-    Args:
-        stages: in the order of training.
-        steps: of the whole run.
 
     Raises:
         TrainingError: no stage, a stage without a step, a name twice, or another sum of steps.
@@ -148,10 +144,8 @@ class Problem:
         return torch.Generator().manual_seed(seed)
 
 
-class MomentsRecord(BaseModel):
+class MomentsRecord(Frozen):
     """`tcmrl_data.Moments` as JSON, kept with a run so that it is rebuilt without its data."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     observation_mean: tuple[float, ...]
     observation_std: tuple[float, ...]
@@ -220,8 +214,6 @@ def pad_trajectories(
     Lanes may hold different numbers of trajectories, or none; what is missing is padding.
 
     Args:
-        trajectories: of every lane.
-        problem: gives sizes and device.
         gamma: discount factor of the returns to go; None leaves out the fields that batches hold only of
             kinds with `returns=True`.
     """

@@ -2,7 +2,9 @@
 
 from typing import Any, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveInt
+from pydantic import Field, PositiveInt
+
+from tcmrl_data.foundation.records import Frozen
 
 PROTOCOL_GROUP = "tcmrl.protocols"
 """The entry point group of protocols, which live in a room above this one."""
@@ -24,7 +26,7 @@ LOGGING_KEYS = frozenset({"log_every", "checkpoint_every"})
 """Settings of `RunSettings` that change no tensor."""
 
 
-class RunSettings(BaseModel):
+class RunSettings(Frozen):
     """The `[training.run]` table.
 
     Attributes:
@@ -54,8 +56,6 @@ class RunSettings(BaseModel):
         final_episodes: episodes of the adapted policy that its final return averages over.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     algorithm: str = "tcmrl"
     steps: int = Field(default=100_000, ge=1)
     snapshots: str = "all"
@@ -73,7 +73,7 @@ class RunSettings(BaseModel):
     final_episodes: int = Field(default=1, ge=1)
 
 
-class BatchSettings(BaseModel):
+class BatchSettings(Frozen):
     """The `[training.batch]` table; a method requests what it reads of it.
 
     Attributes:
@@ -87,8 +87,6 @@ class BatchSettings(BaseModel):
         window_length: K.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     tasks: int = Field(default=16, ge=2)
     transitions: int = Field(default=256, ge=1)
     context_trajectories: tuple[PositiveInt, ...] = Field(default=(1,), min_length=1)
@@ -97,7 +95,7 @@ class BatchSettings(BaseModel):
     window_length: int = Field(default=2, ge=2)
 
 
-class OptimizerSettings(BaseModel):
+class OptimizerSettings(Frozen):
     """The `[training.optimizer]` table.
 
     Attributes:
@@ -106,14 +104,12 @@ class OptimizerSettings(BaseModel):
         gradient_norm: bound of the gradient's norm; absent for none (paper: none).
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     learning_rate: float = Field(default=3e-4, gt=0)
     final_share: float = Field(default=1.0, ge=0, le=1)
     gradient_norm: float | None = Field(default=None, gt=0)
 
 
-class BracSettings(BaseModel):
+class BracSettings(Frozen):
     """The `[training.actor_critic.brac]` table: behavior regularisation by a dual KL estimate (BRAC, FOCAL).
 
     Attributes:
@@ -130,8 +126,6 @@ class BracSettings(BaseModel):
         penalty: weight of the gradient penalty (published code: 5).
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     mode: Literal["off", "policy", "value"] = "off"
     alpha: float = Field(default=50.0, ge=0)
     largest_alpha: float = Field(default=2000.0, gt=0)
@@ -142,7 +136,7 @@ class BracSettings(BaseModel):
     penalty: float = Field(default=5.0, ge=0)
 
 
-class IqlSettings(BaseModel):
+class IqlSettings(Frozen):
     """The `[training.actor_critic.iql]` table: implicit Q-learning (Kostrikov, Nair & Levine, 2021).
 
     Attributes:
@@ -152,14 +146,12 @@ class IqlSettings(BaseModel):
         largest_weight: cap of exp(beta A) (its published code: 100).
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     expectile: float = Field(default=0.7, gt=0, lt=1)
     inverse_temperature: float = Field(default=3.0, ge=0)
     largest_weight: float = Field(default=100.0, gt=0)
 
 
-class ActorCriticSettings(BaseModel):
+class ActorCriticSettings(Frozen):
     """The `[training.actor_critic]` table.
 
     Attributes:
@@ -189,8 +181,6 @@ class ActorCriticSettings(BaseModel):
         iql: implicit Q-learning.
     """
 
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
     kind: Literal["sac", "iql", "bc"] = "sac"
     hidden: tuple[int, ...] = (256, 256, 256)
     gamma: float = Field(default=0.99, ge=0, lt=1)
@@ -216,10 +206,8 @@ UNREAD = {
 """Settings of an actor-critic that a kind of it does not read, by kind."""
 
 
-class TrainingSettings(BaseModel):
+class TrainingSettings(Frozen):
     """What all methods share."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     run: RunSettings = RunSettings()
     batch: BatchSettings = BatchSettings()
@@ -231,7 +219,7 @@ TrainingSource = Literal["table", "recipe", "defaults"]
 """Whence a method's own settings: the given table, the installed recipe's, or the method's defaults."""
 
 
-class TrainingConfig(BaseModel):
+class TrainingConfig(Frozen):
     """A resolved run: the shared settings and the chosen method's own table.
 
     Attributes:
@@ -239,8 +227,6 @@ class TrainingConfig(BaseModel):
         method: the table named after the algorithm, as the method's `Config` dumps it.
         training_source: where the method's own table comes from.
     """
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
 
     settings: TrainingSettings
     method: dict[str, Any]

@@ -56,12 +56,7 @@ def num_uniform_steps(episode: int, *, episodes: int, horizon: int) -> int:
 
 @final
 class UniformStart(Controller):
-    """Uniform actions for the first steps of a rollout, then those of another controller.
-
-    Args:
-        controller: acts later; observes all steps.
-        steps: how many are uniform.
-    """
+    """Uniform actions for the first steps of a rollout, then those of another controller."""
 
     def __init__(self, controller: Controller, *, steps: int) -> None:
         self.view = controller.view

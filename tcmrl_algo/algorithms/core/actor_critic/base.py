@@ -76,10 +76,7 @@ class ActorCritic(nn.Module, abc.ABC):
     """A policy conditioned on a context, and what trains it; `make_actor_critic` picks the kind.
 
     Args:
-        settings: the resolved table.
-        problem: sizes and moments of the data.
         latent: size of the context; 0 makes everything blind to the task.
-        generator: draws the starts.
     """
 
     def __init__(
@@ -139,7 +136,6 @@ class ActorCritic(nn.Module, abc.ABC):
         """The sum of all losses and its parts; every part trains only its own network.
 
         Args:
-            rows: transitions with their contexts.
             generator: draws the policy's actions, where a kind needs them.
         """
 

@@ -47,7 +47,6 @@ def expectile_loss(
     """Mean |tau - 1(u < 0)| u^2 with u = min_k Q'_k(s, a, c) - V(s, c) (IQL, Kostrikov et al., 2021, eq. 5).
 
     Args:
-        values: V(s, c).
         targets: min Q' of the stored actions; no gradient reaches them.
         expectile: tau; 1/2 gives half the squared error, more weighs targets above V more.
     """
