@@ -1,4 +1,4 @@
-"""Contestants in turns, medians and memory, for benchmarks."""
+"""Times, medians and memory, for benchmarks."""
 
 import os
 import statistics
@@ -9,29 +9,6 @@ from typing import Any
 
 REPEATS = 5
 Measured = dict[str, Any]
-
-
-def race(before: Callable[[], object], after: Callable[[], object], *, per: int) -> Measured:
-    """Milliseconds a part of two contestants in turns, after one round that does not count."""
-    rounds = [(_times(before), _times(after)) for _ in range(REPEATS + 1)][1:]
-    sides = {
-        side: {
-            name: median([1000 * both[position][clock] / per for both in rounds])
-            for clock, name in enumerate(("ms", "processor_ms"))
-        }
-        for position, side in enumerate(("before", "after"))
-    }
-    ratios = {
-        name: median([one[clock] / other[clock] for one, other in rounds])
-        for clock, name in enumerate(("ratio", "processor_ratio"))
-    }
-    return {"parts": per, **sides, **ratios}
-
-
-def _times(run: Callable[[], object]) -> tuple[float, float]:
-    """Wall time of a call, and time of this process's processors."""
-    used = time.process_time()
-    return seconds(run), time.process_time() - used
 
 
 def seconds(run: Callable[[], object]) -> float:
