@@ -185,6 +185,33 @@ def test_parquet_lies_in_a_folder_per_split(tiny: Dataset, tmp_path: Path) -> No
     assert places == {f"{task.split}/task_{task.index:05d}.parquet" for task in tiny.tasks}
 
 
+@pytest.mark.parametrize(
+    ("name", "episode_bytes"), [("hdf5", 1_500), ("minari", 3_000), ("robomimic", 4_000)]
+)
+def test_hdf5_keeps_short_episodes_small(
+    name: str, episode_bytes: int, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Episodes of 20 steps have 540 bytes, in files of 1,000 and more a task."""
+    original = Dataset.trajectories
+    monkeypatch.setattr(Dataset, "trajectories", lambda self, *key: original(self, *key) * 50)
+    files = exported(tiny, name, tmp_path / "out", tasks=[0], snapshots="last")
+    assert sum(file.stat().st_size for file in files) < 300 * episode_bytes
+
+
+@pytest.mark.parametrize("name", ["hdf5", "minari", "robomimic"])
+def test_hdf5_compresses_long_episodes(
+    name: str, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    zeros = np.zeros(4_000, np.float32)
+    flags = np.arange(4_000) == 3_999
+    episode = Trajectory(
+        np.zeros((4_001, 2), np.float32), np.tile(zeros, (2, 1)).T, zeros, flags, np.zeros(4_000, bool)
+    )
+    monkeypatch.setattr(Dataset, "trajectories", lambda self, *key: [episode])
+    files = exported(tiny, name, tmp_path / "out", tasks=[0], snapshots="last")
+    assert sum(file.stat().st_size for file in files) < 40_000 < episode.observations.nbytes * 2
+
+
 @pytest.mark.parametrize("name", READERS)
 def test_every_format_takes_a_selection(name: str, tiny: Dataset, tmp_path: Path) -> None:
     files = exported(tiny, name, tmp_path / "out", tasks=[0, 3, 40], split="train", tier="expert")

@@ -18,8 +18,19 @@ from tests.strategies import trajectories
 def read_groups(path: Path) -> list[Trajectory]:
     """The episodes of a file, as the documentation reads them."""
     with h5py.File(path) as file:
-        groups = [{name: array[:] for name, array in group.items()} for group in file["episodes"].values()]
-    return [Trajectory(*(group.pop(name) for name in EPISODE_ARRAYS), group) for group in groups]
+        index = {name: array[:] for name, array in file["episodes"].items()}
+        flat = {name: array[:] for name, array in file.items() if name != "episodes"}
+    names = ("actions", "rewards", "terminals", "timeouts")
+    extras = flat.keys() - {*names, "observations", "next_observations", "episode", "step"}
+    episodes = []
+    for stop, length, final in zip(
+        index["length"].cumsum(), index["length"], index["final_observation"], strict=True
+    ):
+        rows = slice(stop - length, stop)
+        observations = np.concatenate([flat["observations"][rows], [final]])
+        arrays = (flat[name][rows] for name in names)
+        episodes.append(Trajectory(observations, *arrays, {name: flat[name][rows] for name in extras}))
+    return episodes
 
 
 def assert_equal(left: Trajectory, right: Trajectory) -> None:

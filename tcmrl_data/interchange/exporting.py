@@ -47,8 +47,8 @@ FILE_BYTES = 2**16
 COPIES = 4
 """A step is written at most this often: in its episode, and flat with its two observations."""
 
-EPISODE_BYTES = 2**15
-"""Room for the records that HDF5 keeps of an episode's arrays; Minari's take 16 kB."""
+EPISODE_BYTES = 2**12
+"""Room for the records that HDF5 keeps of an episode's arrays; robomimic's take 3 kB."""
 
 CLAIM, LOCK, FINISHED, OPEN = "export", "lock", "finished", "open"
 """In the staging folder: what is exported, the lock, finished tasks, and the task that is being written."""

@@ -1,24 +1,27 @@
-"""HDF5, one file per task: flat arrays in the manner of D4RL, and one group per episode.
+"""HDF5, one file per task: flat arrays in the manner of D4RL, and where each episode lies in them.
 
 ```
 /observations /actions /rewards /next_observations    (N, …) float32, all episodes behind one another
 /terminals /timeouts                                  (N,) bool; a time limit is never a terminal
 /episode /step                                        (N,) int64: number of the episode, its snapshot's step
 /success …                                            (N,) further per-step arrays, where the dataset has them
-/episodes/000000/{observations (T + 1, …), actions, rewards, terminated, truncated, …}
+/episodes/{length, step} (E,) int64, return (E,)      of every episode; `return` is undiscounted
+/episodes/final_observation (E, …)                    after the last step of every episode
 ```
 
-Attributes of the file name the environment, the task with its parameters and split, the seed, and the
-dataset it came from.
+All are compressed by gzip in chunks of at most 1 MiB. Attributes of the file name the environment, the task
+with its parameters and split, the seed, and the dataset it came from.
 
-Three layouts are read, which are told apart by what a file holds. `tcmrl`: the one above, of which the groups
-are read. `d4rl`: flat arrays of one task, `/observations /actions /rewards /terminals` and, where there are
-any, `/timeouts /next_observations`; other arrays are left out. `robomimic`: see `robomimic.py`.
+Three layouts are read, which are told apart by what a file holds. `tcmrl`: the one above. `d4rl`: flat arrays
+of one task, `/observations /actions /rewards /terminals` and, where there are any, `/timeouts
+/next_observations`; other arrays are left out. `robomimic`: see `robomimic.py`.
 """
 
-from collections.abc import Iterator, Mapping
+import itertools
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal, final
+from typing import Any, Literal, final
 
 import h5py
 import numpy as np
@@ -26,9 +29,10 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Task
+from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.interchange.exporting import Format, episode_arrays, transitions
-from tcmrl_data.interchange.hdf5_file import Hdf5File
+from tcmrl_data.interchange.exporting import Format, transitions
+from tcmrl_data.interchange.hdf5_file import Hdf5File, new_file
 from tcmrl_data.interchange.reader import (
     EpisodeCuts,
     FileTask,
@@ -36,6 +40,8 @@ from tcmrl_data.interchange.reader import (
     Reader,
     ReadPart,
     Say,
+    checked_index,
+    damage_at,
     episodes_of_rows,
     parts_of_task,
     stored_episode,
@@ -45,8 +51,13 @@ from tcmrl_data.store.tables import PartKey
 
 Layout = Literal["tcmrl", "d4rl", "robomimic"]
 
-CHUNK_ROWS = 4_096
+CHUNK_ROWS, CHUNK_BYTES = 4_096, 2**20
+"""The most of a chunk; HDF5 keeps one of 1 MiB in memory while it is filled."""
+
 FLAT_NAMES = {"terminated": "terminals", "truncated": "timeouts"}
+FOR_FLAT_READERS = ("next_observations", "episode", "step")
+"""Arrays that `/episodes` says too."""
+
 D4RL_ARRAYS = ("observations", "actions", "rewards", "terminals")
 D4RL_OPTIONAL = ("timeouts", "next_observations")
 
@@ -60,34 +71,41 @@ class Hdf5Format(Format):
     takes_empty_episodes = True
 
     def write(self, selection: Selection, task: Task, path: Path) -> Iterator[PartKey]:
-        with h5py.File(path, "x") as file:
+        with new_file(path, "x") as file:
             file.attrs.update(self.attributes(selection, task))
             steps = [key.step for key in selection.parts[task.index]]
             file.attrs["snapshots"] = np.array(steps, dtype=np.int64)
-            groups = file.create_group("episodes")
+            episodes = 0
             for key, trajectories in self.parts(selection, task, path):
-                first = len(groups)
-                _append(file, transitions(trajectories, first=first, step=key.step))
-                for index, trajectory in enumerate(trajectories, start=first):
-                    group = groups.create_group(f"{index:06d}")
-                    group.attrs["step"] = key.step
-                    group.attrs["return"] = trajectory.undiscounted_return
-                    for name, array in episode_arrays(trajectory).items():
-                        group.create_dataset(name, data=array)
+                _append(file, transitions(trajectories, first=episodes, step=key.step))
+                _append(file.require_group("episodes"), _index(trajectories, key.step))
+                episodes += len(trajectories)
                 file.flush()  # what the file keeps in memory is counted as room otherwise
                 yield key
 
 
-def _append(file: h5py.File, arrays: Mapping[str, npt.NDArray[np.generic]]) -> None:
+def _index(trajectories: Sequence[Trajectory], step: int) -> dict[str, npt.NDArray[Any]]:
+    """What finds the episodes of a part in the flat arrays and completes them."""
+    return {
+        "length": np.array([len(trajectory) for trajectory in trajectories], dtype=np.int64),
+        "step": np.full(len(trajectories), step, dtype=np.int64),
+        "return": np.array([trajectory.undiscounted_return for trajectory in trajectories]),
+        "final_observation": np.stack([trajectory.observations[-1] for trajectory in trajectories]),
+    }
+
+
+def _append(group: h5py.Group, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
     for name, array in arrays.items():
-        flat = file.get(FLAT_NAMES.get(name, name))
+        flat = group.get(FLAT_NAMES.get(name, name))
         if flat is None:
-            flat = file.create_dataset(
+            row_bytes = array.itemsize * math.prod(array.shape[1:])
+            rows = min(CHUNK_ROWS, max(1, CHUNK_BYTES // max(1, row_bytes)))
+            flat = group.create_dataset(
                 FLAT_NAMES.get(name, name),
                 shape=(0, *array.shape[1:]),
                 maxshape=(None, *array.shape[1:]),
                 dtype=array.dtype,
-                chunks=(CHUNK_ROWS, *array.shape[1:]),
+                chunks=(rows, *array.shape[1:]),
                 compression="gzip",
                 compression_opts=1,
                 shuffle=True,
@@ -153,17 +171,26 @@ def _layout_of(file: Hdf5File) -> Layout:
 
 
 def _read_ours(file: Hdf5File, cuts: EpisodeCuts) -> Iterator[ReadPart]:
-    task = file.task()
-    groups = [f"/episodes/{name}" for name in file.members("/episodes")]
-    episodes = (
-        (
-            file.step(group, "step"),
-            stored_episode(
-                {name: file.array(f"{group}/{name}") for name in file.members(group)},
-                cuts=cuts,
-                place=f"{file.path}: {group}",
-            ),
-        )
-        for group in groups
+    lengths, steps, final = (
+        file.array(f"/episodes/{name}") for name in ("length", "step", "final_observation")
     )
-    return parts_of_task(episodes, task, place=str(file.path))
+    stored = {flat: name for name, flat in FLAT_NAMES.items()}
+    names = [name for name in file.members("/") if file.rank(f"/{name}") and name not in FOR_FLAT_READERS]
+    arrays = {stored.get(name, name): file.array(f"/{name}") for name in names}
+    place = f"{file.path}: /episodes"
+    with damage_at(f"{place}:"):
+        stops = list(itertools.accumulate(lengths.tolist(), initial=0))
+        if not len(lengths) == len(steps) == len(final) or {lengths.dtype.kind, steps.dtype.kind} - set("iu"):
+            raise ValueError("length, step and final_observation do not belong together")
+        if stops != sorted(stops) or any(len(array) != stops[-1] for array in arrays.values()):
+            raise ValueError("length does not add up to the rows of every array")
+
+    def episodes() -> Iterator[tuple[int, Trajectory]]:
+        for index, (start, stop) in enumerate(itertools.pairwise(stops)):
+            rows = {name: array[start:stop] for name, array in arrays.items()}
+            with damage_at(f"{place}: {index}:"):
+                rows["observations"] = np.concatenate([rows["observations"], final[index : index + 1]])
+            step = checked_index(int(steps[index]), f"{place}/step")
+            yield step, stored_episode(rows, cuts=cuts, place=f"{place}: {index}")
+
+    return parts_of_task(episodes(), file.task(), place=str(file.path))

@@ -1,4 +1,6 @@
-"""HDF5 files of strangers: numbers and short texts of plain datasets, and nothing else.
+"""HDF5 files: how small arrays are written, and how the files of strangers are read.
+
+Numbers and short texts of plain datasets are read, and nothing else.
 
 Links other than hard ones, and external and virtual storage, are refused before they are followed, since they
 may lead to other files. h5py reads the rest. It would unpack a chunk to whatever size it holds, so that
@@ -36,6 +38,25 @@ FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLE
 
 NUMBERS = "biuf"
 """Kinds of the types that are read: truth values, integers, floats."""
+
+
+SMALLEST_PACKED = 2**10
+"""Bytes of an array from which on gzip is worth its time."""
+
+
+def new_file(path: Path, mode: str) -> h5py.File:
+    """A new file, whose records are short, as HDF5 1.10 and later write and read them."""
+    return h5py.File(path, mode, libver=("v110", "v110"))
+
+
+def write_array(group: h5py.Group, name: str, array: npt.NDArray[Any]) -> None:
+    """Writes an array in one piece, compressed where it is not small."""
+    if array.nbytes < SMALLEST_PACKED:
+        group.create_dataset(name, data=array)
+    else:
+        group.create_dataset(
+            name, data=array, chunks=array.shape, compression="gzip", compression_opts=1, shuffle=True
+        )
 
 
 class Hdf5File(contextlib.AbstractContextManager["Hdf5File"]):

@@ -33,14 +33,14 @@ from gymnasium.utils import RecordConstructorArgs
 
 from tcmrl_data.dataset.dataset import Dataset, TaskReferences
 from tcmrl_data.dataset.selection import Selection
-from tcmrl_data.envs.base import Task, make_environment
+from tcmrl_data.envs.base import ENVIRONMENTS, Environment, Task, make_environment
 from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.interchange.exporting import Format
-from tcmrl_data.interchange.hdf5_file import Hdf5File
+from tcmrl_data.interchange.hdf5_file import Hdf5File, new_file, write_array
 from tcmrl_data.interchange.reader import (
     EpisodeCuts,
     FileTask,
@@ -54,16 +54,15 @@ from tcmrl_data.interchange.reader import (
     stored_episode,
 )
 from tcmrl_data.recipe.document import AND
+from tcmrl_data.store.part import Platform
 from tcmrl_data.store.tables import PartKey
 
 if TYPE_CHECKING:
-    from minari.data_collector import EpisodeBuffer
+    import h5py
 
 METADATA_KEY = "tcmrl"
 STEP_ATTRIBUTE = "snapshot_step"
 METADATA, CONTENT = "metadata.json", "main_data.hdf5"
-NEEDED_BY_TASKS = ("tcmrl", "gymnasium", "mujoco", "metaworld")
-"""Packages without which a task cannot be made again."""
 
 
 @final
@@ -96,16 +95,18 @@ class MinariFormat(Format):
             written.storage.update_metadata(
                 {"ref_max_score_source": source, METADATA_KEY: json.dumps(self.attributes(selection, task))}
             )
-            for key, trajectories in self.parts(selection, task, path / "data" / CONTENT):
-                first = written.total_episodes
-                written.update_dataset_from_buffer(
-                    [_buffer(dataset, key, index, episode) for index, episode in enumerate(trajectories)]
-                )
-                written.storage.update_episode_metadata(
-                    [{STEP_ATTRIBUTE: key.step}] * len(trajectories),
-                    range(first, first + len(trajectories)),
-                )
-                yield key
+            episodes = steps = 0
+            with new_file(content := path / "data" / CONTENT, "w") as file:
+                for key, trajectories in self.parts(selection, task, content):
+                    for index, trajectory in enumerate(trajectories):
+                        group = file.create_group(f"episode_{episodes}")
+                        group.attrs.update({"id": episodes, "total_steps": len(trajectory)})
+                        _write_episode(group, dataset, key, index, trajectory)
+                        episodes, steps = episodes + 1, steps + len(trajectory)
+                    file.flush()  # what the file keeps in memory is counted as room otherwise
+                    yield key
+            written.storage.update_metadata({"total_episodes": episodes, "total_steps": steps})
+            written.storage.update_metadata({"dataset_size": written.storage.get_size()})
 
     def accompanying(self, selection: Selection) -> Mapping[str, bytes]:
         namespace = Path(self.place(selection, selection.tasks[0])).parent
@@ -173,7 +174,6 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
         )
     references = dataset.references(task.index)
     platform = dataset.manifest.platforms[dataset.entry(selection.parts[task.index][0]).platform]
-    packages = {"tcmrl": version("tcmrl"), **platform.packages}
     return {
         "env": spec,
         "eval_env": spec,
@@ -183,9 +183,7 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
         "ref_min_score": references.uniform,
         "ref_max_score": None if references.uniform is None else _best(references)[1],
         "num_episodes_average_score": recipe.rollouts.episodes,
-        "requirements": [
-            f"{package}=={packages[package]}" for package in NEEDED_BY_TASKS if package in packages
-        ],
+        "requirements": _requirements(environment, platform),
         "description": (
             f"Task {task.index} of {dataset.name} ({task.split}), parameters "
             f"{json.dumps(dict(task.parameters), sort_keys=True)}. {recipe.about.description} "
@@ -193,6 +191,15 @@ def _description(selection: Selection, task: Task) -> dict[str, Any]:
             f"Exported from the dataset with root {dataset.manifest.root}."
         ),
     }
+
+
+def _requirements(environment: Environment, platform: Platform) -> list[str]:
+    """The packages without which a task cannot be made again, as they were when its data were."""
+    provider = ENVIRONMENTS.provider(environment.name.partition("/")[0])
+    simulator = platform.physics.get("versions")
+    names = ("gymnasium", provider, *(simulator if isinstance(simulator, Mapping) else ()))
+    versions = {"tcmrl": version("tcmrl"), **platform.packages}
+    return [f"{name}=={versions[name]}" for name in dict.fromkeys(["tcmrl", *names]) if name in versions]
 
 
 def _best(references: TaskReferences) -> tuple[str, float]:
@@ -204,24 +211,26 @@ def _best(references: TaskReferences) -> tuple[str, float]:
     return "behavior", references.behavior
 
 
-def _buffer(dataset: Dataset, key: PartKey, episode: int, trajectory: Trajectory) -> "EpisodeBuffer":
-    from minari.data_collector import EpisodeBuffer
-
+def _write_episode(
+    group: "h5py.Group", dataset: Dataset, key: PartKey, index: int, trajectory: Trajectory
+) -> None:
+    """Writes an episode as Minari's HDF5 storage does, but its arrays compressed."""
     seed = dataset.part(*key).identity.seed
-    return EpisodeBuffer(
-        seed=None
-        if seed is None
-        else keyed_seed(seed, dataset.name, key.task, Purpose.ROLLOUT_RESET, key.step, episode),
-        observations=trajectory.observations,
-        actions=trajectory.actions,
-        rewards=trajectory.rewards,
-        terminations=trajectory.terminated,
-        truncations=trajectory.truncated,
-        infos={
-            name: np.concatenate([np.zeros(1, values.dtype), values])
-            for name, values in trajectory.extras.items()
-        },
-    )
+    if seed is not None:
+        group.attrs["seed"] = keyed_seed(seed, dataset.name, key.task, Purpose.ROLLOUT_RESET, key.step, index)
+    group.attrs[STEP_ATTRIBUTE] = key.step
+    arrays = {
+        "observations": trajectory.observations,
+        "actions": trajectory.actions,
+        "rewards": trajectory.rewards,
+        "terminations": trajectory.terminated,
+        "truncations": trajectory.truncated,
+    }
+    for name, values in arrays.items():
+        write_array(group, name, values)
+    infos = group.create_group("infos")
+    for name, values in trajectory.extras.items():
+        write_array(infos, name, np.concatenate([np.zeros(1, values.dtype), values]))
 
 
 @final

@@ -31,7 +31,7 @@ from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.interchange.exporting import Format, episode_arrays
-from tcmrl_data.interchange.hdf5_file import Hdf5File
+from tcmrl_data.interchange.hdf5_file import Hdf5File, new_file, write_array
 from tcmrl_data.interchange.reader import (
     EpisodeCuts,
     FileTask,
@@ -63,7 +63,7 @@ class RobomimicFormat(Format):
             "env_kwargs": {"settings": settings, "parameters": dict(task.parameters)},
         }
         names: dict[int, list[bytes]] = {}
-        with h5py.File(path, "x") as file:
+        with new_file(path, "x") as file:
             file.attrs.update(self.attributes(selection, task))
             data = file.create_group("data")
             data.attrs["env_args"] = json.dumps(environment)
@@ -91,7 +91,7 @@ def _write_demonstration(group: h5py.Group, trajectory: Trajectory, step: int) -
     arrays[f"obs/{OBSERVATION_KEY}"] = observations[:-1]
     arrays[f"next_obs/{OBSERVATION_KEY}"] = observations[1:]
     for name, array in arrays.items():
-        group.create_dataset(name, data=array)
+        write_array(group, name, array)
 
 
 def read_robomimic(file: Hdf5File, keys: tuple[str, ...] | None, cuts: EpisodeCuts) -> Iterator[ReadPart]:

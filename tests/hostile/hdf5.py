@@ -61,25 +61,21 @@ def overfull_chunk(file: h5py.File, places: Places) -> None:
 
 
 def looped(places: Places) -> Path:
-    """Our own layout, in which a million episodes are one: groups that hold themselves."""
+    """robomimic's layout, in which 2,000 demonstrations are one: links to the same group."""
     places.folder.mkdir()
-    path = places.folder / "ours.hdf5"
+    path = places.folder / "demonstrations.hdf5"
     with h5py.File(path, "w") as file:
-        file.attrs.update({"format": "tcmrl-hdf5", "format_version": 1, "task": 0, "split": "train"})
-        file.attrs["parameters"] = "{}"
-        first = file.create_group("episodes/000000")
-        first.attrs["step"] = 0
+        first = file.create_group("data/demo_0")
         arrays = {
-            "observations": np.zeros((20_001, 2), dtype=np.float32),
+            "obs/flat": np.zeros((20_000, 2), dtype=np.float32),
             "actions": np.zeros((20_000, 1), dtype=np.float32),
             "rewards": np.zeros(20_000, dtype=np.float32),
-            "terminated": np.zeros(20_000, dtype=bool),
-            "truncated": np.zeros(20_000, dtype=bool),
+            "dones": np.zeros(20_000, dtype=np.int64),
         }
         for name, array in arrays.items():
             first.create_dataset(name, data=array, compression="gzip")
         for number in range(1, 2_000):
-            file[f"episodes/{number:06d}"] = first
+            file[f"data/demo_{number}"] = first
     return path
 
 
@@ -95,18 +91,19 @@ def ours(**attributes: Any) -> Make:
                 "split": "train",
                 "parameters": "{}",
             }
-            file.attrs.update(plain | {name: value for name, value in attributes.items() if name != "step"})
-            group = file.create_group("episodes/000000")
-            group.attrs["step"] = attributes.get("step", 0)
+            file.attrs.update(plain | {name: value for name, value in attributes.items() if name in plain})
             ended = np.array([False, True])
             for name, array in (
-                ("observations", np.zeros((3, 1), dtype=np.float32)),
+                ("observations", np.zeros((2, 1), dtype=np.float32)),
                 ("actions", np.zeros((2, 1), dtype=np.float32)),
                 ("rewards", np.zeros(2, dtype=np.float32)),
-                ("terminated", ended),
-                ("truncated", ~ended if attributes.get("early") else ended),
+                ("terminals", ended),
+                ("timeouts", ~ended if attributes.get("early") else ended),
+                ("episodes/length", attributes.get("length", np.array([2]))),
+                ("episodes/step", np.array(attributes.get("step", [0]))),
+                ("episodes/final_observation", attributes.get("final", np.zeros((1, 1), np.float32))),
             ):
-                group[name] = array
+                file[name] = array
         return path
 
     return make
@@ -181,11 +178,16 @@ HDF5: dict[str, Make] = {
     "hdf5: a type": hdf5(lambda file, _: file.__setitem__("observations", np.dtype("f4"))),
     "hdf5: one episode 2,000 times": looped,
     "hdf5: a task of another world": ours(task=2**40),
-    "hdf5: a negative step": ours(step=-1),
-    "hdf5: a text for a step": ours(step="x"),
+    "hdf5: a negative step": ours(step=[-1]),
+    "hdf5: a text for a step": ours(step=[b"x"]),
     "hdf5: parameters in brackets": ours(parameters="[" * 60_000),
     "hdf5: parameters that write to a terminal": ours(parameters=json.dumps({"a": "\x1b]0;owned\x07"})),
     "hdf5: an early flag": ours(early=True),
+    "hdf5: episodes beyond the rows": ours(length=np.array([2**62])),
+    "hdf5: episodes that go back": ours(length=np.array([4, -2]), step=[0, 0], final=np.zeros((2, 1))),
+    "hdf5: no list of episodes": ours(length=np.array(2)),
+    "hdf5: more episodes than final observations": ours(length=np.array([1, 1])),
+    "hdf5: final observations of another shape": ours(final=np.zeros((1, 3))),
     "hdf5: an attribute of many": ours(format_version=np.ones(1000)),
     "hdf5: no HDF5": not_hdf5,
     "hdf5: a pipe": pipe_file,
