@@ -107,11 +107,16 @@ def export(
     "--out",
     type=PATH,
     metavar="PATH",
-    show_default="standard output; of croissant the dataset",
+    show_default="standard output; of croissant the dataset, with --viewer its README.md",
     help="File to write, such as README.md; of croissant a folder.",
 )
+@click.option(
+    "--viewer",
+    is_flag=True,
+    help="Beside the README, write Parquet that Hugging Face shows and load_dataset reads.",
+)
 @QUIET_OPTION
-def card(dataset: Path, form: str, out: Path | None) -> None:
+def card(dataset: Path, form: str, out: Path | None, viewer: bool) -> None:
     """Write the README of DATASET, how to cite it, or its description for search engines.
 
     The README says what the dataset is, how it was made, returns, tiers, limits, licence and citation. It
@@ -121,12 +126,16 @@ def card(dataset: Path, form: str, out: Path | None) -> None:
     and references are those of [about] in the recipe. The version is the beginning of the root, so that equal
     data have an equal version.
 
+    With --viewer, the folder viewer/ beside the README holds transitions, episodes, parts and tasks as
+    Parquet, training and test tasks apart, and the front matter names them.
+
     croissant.json and its two tables, a line per task and a line per part, are read by programs that search
     for data.
 
     \b
     Examples:
       tcmrl-data card data/point-robot --out data/point-robot/README.md
+      tcmrl-data card data/point-robot --viewer
       tcmrl-data card data/point-robot --format bibtex
       tcmrl-data card data/point-robot --format croissant
     """
@@ -135,15 +144,25 @@ def card(dataset: Path, form: str, out: Path | None) -> None:
     from tcmrl_data.describe.cite import citation_text
     from tcmrl_data.describe.croissant import write_croissant
 
+    if viewer and form != "readme":
+        raise click.UsageError(f"--viewer belongs to the README, not to --format {form}")
     opened = tcmrl_data.open_dataset(dataset)
+    if out is None and opened.path != opened.folder and (viewer or form == "croissant"):
+        kind = "a README.md" if viewer else "one"
+        raise click.UsageError(f"{dataset} is a view, which has no folder; name {kind} by --out")
+    if viewer and out is None:
+        out = opened.folder / "README.md"
     if form == "croissant":
-        if out is None and opened.path != opened.folder:
-            raise click.UsageError(f"{dataset} is a view, which has no folder; name one by --out")
         file = write_croissant(opened, out)
         click.echo(f"{printable(str(file))}: {len(opened.tasks):,} tasks, {len(opened.parts):,} parts")
         return
     if form == "readme" and out is not None:
-        write_card(opened, out)
+        file = out
+
+        def work(progress: PartsProgress) -> None:
+            write_card(opened, file, viewer=viewer, progress=progress)
+
+        with_progress(work, stage="viewer", out=file.parent) if viewer else write_card(opened, file)
         remark(f"what you write below {BEGIN!r} stays when it is written again")
     else:
         text = dataset_card(opened) if form == "readme" else citation_text(opened.manifest, form)  # type: ignore[arg-type] # click checked it

@@ -142,3 +142,44 @@ def test_an_imported_dataset_says_what_is_not_known(tiny: Dataset, tmp_path: Pat
     assert front_matter(card)["license"] == "other"
     for text in ("No seed is known", "they hold no policies", "No returns of uniform actions"):
         assert text in card
+
+
+def test_the_viewers_files_are_named_and_hold_their_splits(call: Call, tiny_copy: Copy) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    dataset = tcmrl_data.open_dataset(tiny_copy())
+    for _ in range(2):  # a second time the transitions stay
+        code, output, _ = call("card", dataset.folder, "--viewer")
+        assert (code, output) == (0, f"{dataset.folder / 'README.md'} written\n")
+    assert 'load_dataset("FOLDER", "transitions")' in (dataset.folder / "README.md").read_text()
+    rows = {"transitions": 360, "episodes": 18, "parts": 3, "tasks": 1}
+    configs = front_matter((dataset.folder / "README.md").read_text())["configs"]
+    assert [config["config_name"] for config in configs] == list(rows)
+    for config in configs:
+        assert [files["split"] for files in config["data_files"]] == ["train", "test"]
+        for files, tasks in zip(config["data_files"], (dataset.train_tasks, dataset.test_tasks), strict=True):
+            tables = [parquet.read_table(file) for file in sorted(dataset.folder.glob(files["path"]))]
+            assert sum(map(len, tables)) == rows[config["config_name"]] * len(tasks)
+            found = {task for table in tables for task in table.column("task").to_pylist()}
+            assert found == {task.index for task in tasks}
+    episodes = parquet.read_table(dataset.folder / "viewer/test/episodes.parquet").to_pylist()
+    for row, episode in zip(episodes, dataset.select(tasks=[3]).trajectories(3), strict=True):
+        assert row["length"] == len(episode)
+        assert row["return"] == pytest.approx(episode.undiscounted_return)
+        assert (row["terminated"], row["truncated"]) == (episode.terminated[-1], episode.truncated[-1])
+    parts = parquet.read_schema(dataset.folder / "viewer/test/parts.parquet")
+    assert str(parts.field("success_rate").type) == "double"
+    assert tcmrl_data.verify_dataset(dataset.folder).findings == ()
+    assert tcmrl_data.delete_dataset(dataset.folder).kept == ("README.md",)
+
+
+def test_a_viewer_of_other_data_stays(call: Call, tiny: Dataset, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    view = tmp_path / "view.json"
+    tcmrl_data.derive_dataset(tiny, view=view, tasks=[0], snapshots="last")
+    assert_refused(call("card", view, "--viewer"), "name a README.md by --out")
+    assert_refused(call("card", view, "--viewer", "--format", "cff"), "--viewer belongs to the README")
+    assert call("card", view, "--viewer", "--out", tmp_path / "README.md")[0] == 0
+    assert len(front_matter((tmp_path / "README.md").read_text())["configs"][0]["data_files"]) == 1
+    assert_refused(
+        call("card", tiny.folder, "--viewer", "--out", tmp_path / "README.md"), "of other data; remove it"
+    )

@@ -6,6 +6,7 @@ most once a second, so that anyone may read it at any time.
 
 import contextlib
 import os
+import re
 import stat
 import time
 from collections import deque
@@ -41,6 +42,14 @@ CROISSANT_TASKS = "croissant-tasks.jsonl"
 CROISSANT_FILES = {CROISSANT, CROISSANT_PARTS, CROISSANT_TASKS}
 DESCRIPTIONS = {"README.md"} | CROISSANT_FILES
 """Files that may lie beside the data and say nothing that the data do not say."""
+
+VIEWER = "viewer"
+"""Folder of the same kind, which `describe.viewer` writes."""
+
+
+def is_viewer_file(file: str) -> bool:
+    """Whether the path of a file within a dataset is one of the viewer's."""
+    return re.fullmatch(rf"{VIEWER}/(train|test)/\w+\.parquet", file) is not None
 
 
 def check_work_files(folder: Path, *, but: Collection[str] = ()) -> None:

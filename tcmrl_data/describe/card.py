@@ -1,6 +1,6 @@
 """The card of a dataset: a README with front matter for hubs, made of what the dataset says of itself."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from statistics import fmean
 from typing import Any
@@ -13,6 +13,7 @@ from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.listing import dataset_summary, list_returns, summarize_returns
 from tcmrl_data.dataset.selection import TIERS
 from tcmrl_data.describe.cite import citation_text
+from tcmrl_data.describe.viewer import viewer_configs, write_viewer
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import StoreError, TcmrlError
 from tcmrl_data.foundation.machine import size
@@ -37,14 +38,28 @@ HUB_LICENCES = frozenset(_HUB_NAMES.split())
 """Identifiers of licences that front matter may hold (https://huggingface.co/docs/hub/repositories-licenses)."""
 
 
-def write_card(dataset: Dataset, file: Path) -> None:
+def write_card(
+    dataset: Dataset,
+    file: Path,
+    *,
+    viewer: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
     """Writes the card; text between the marks of an older card stays.
 
+    Args:
+        viewer: write Parquet beside the card too, and name it in the front matter (`describe.viewer`).
+        progress: of the Parquet; called with the number of parts written and of all parts.
+
     Raises:
+        MissingPackageError: the viewer's files need a package that is not installed.
         StoreError: the file is no plain file, or has not exactly one pair of marks; text would be lost.
         StorageError: the operating system refuses the operation.
     """
-    replace_file(file, dataset_card(dataset, kept=_kept_text(file)).encode())
+    kept = _kept_text(file)
+    if viewer:
+        write_viewer(dataset, file.parent, progress=progress)
+    replace_file(file, dataset_card(dataset, kept=kept, viewer=viewer).encode())
 
 
 def _kept_text(file: Path) -> str:
@@ -64,14 +79,17 @@ def _kept_text(file: Path) -> str:
     return kept.strip("\n")
 
 
-def dataset_card(dataset: Dataset, *, kept: str = "") -> str:
+def dataset_card(dataset: Dataset, *, kept: str = "", viewer: bool = False) -> str:
     """The card as Markdown, by the template `card.md.jinja`.
 
     Args:
         kept: Markdown of people, which stands below the summary between the marks.
+        viewer: name the viewer's files in the front matter.
     """
     manifest, summary, quality = dataset.manifest, dataset_summary(dataset), measure_quality(dataset)
     front_matter = _front_matter(dataset, summary)
+    if viewer:
+        front_matter["configs"] = viewer_configs(dataset)
     spreads = {(stage.step, stage.split): stage.tq for stage in quality.stages}
     returns = summarize_returns(list_returns(dataset))
     for row in returns:
@@ -94,6 +112,7 @@ def dataset_card(dataset: Dataset, *, kept: str = "") -> str:
         summary=summary,
         begin=BEGIN,
         kept=kept,
+        viewer=viewer,
         end=END,
         size=size(summary["bytes"]),
         made_with=[(word, value) for word, value in made_with if value],

@@ -207,10 +207,11 @@ def _task_lines(dataset: Dataset) -> bytes:
 
 
 def _part_lines(dataset: Dataset) -> bytes:
-    return b"".join(canonical_json(_part_row(entry)) for entry in dataset.parts.entries())
+    return b"".join(canonical_json(part_row(entry)) for entry in dataset.parts.entries())
 
 
-def _part_row(entry: PartEntry) -> dict[str, Any]:
+def part_row(entry: PartEntry) -> dict[str, Any]:
+    """The fields of `PART_FIELDS`; what is not known is None."""
     values = {name: getattr(entry, name, None) for name in PART_FIELDS} | {"file": part_file(entry.key)}
     return {
         name: None if isinstance(value, float) and math.isnan(value) else value

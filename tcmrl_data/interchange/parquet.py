@@ -142,13 +142,13 @@ def _table(trajectories: Sequence[Trajectory], task: Task, key: PartKey, *, firs
     for name in dict.fromkeys([*COLUMNS, *arrays]):
         array = arrays[name]
         columns[COLUMNS.get(name, name)] = _lists(array) if array.ndim == 2 else pyarrow.array(array)
-    for name, value in _parameters(task).items():
+    for name, value in parameter_columns(task).items():
         columns[name] = pyarrow.array([value]).take(every_row)
     fields = [pyarrow.field(name, column.type, nullable=False) for name, column in columns.items()]
     return pyarrow.table(columns, schema=pyarrow.schema(fields))
 
 
-def _parameters(task: Task) -> dict[str, float | list[float] | str]:
+def parameter_columns(task: Task) -> dict[str, float | list[float] | str]:
     """The task's parameters by column; whole numbers too become floats, so that all tasks have one type."""
     values: dict[str, float | list[float] | str] = {}
     for path, value in leaves(task.parameters):
@@ -161,6 +161,47 @@ def _parameters(task: Task) -> dict[str, float | list[float] | str]:
             made = json.dumps(value)
         values[PARAMETER + "_".join(path)] = made
     return values
+
+
+def episode_rows(files: Sequence[Path]) -> list[dict[str, Any]]:
+    """A row per episode of exported files: its part, length, undiscounted return and how it ended."""
+    from pyarrow import parquet
+
+    keys = ["task", "split", "step", "run", "episode"]
+    rows: list[dict[str, Any]] = []
+    for file in files:
+        steps = parquet.read_table(file, columns=[*keys, "reward", "terminated", "truncated"])
+        episodes = steps.group_by(keys).aggregate(
+            [("reward", "count"), ("reward", "sum"), ("terminated", "any"), ("truncated", "any")]
+        )
+        episodes = episodes.sort_by("episode")
+        names = {"reward_count": "length", "reward_sum": "return"}
+        names |= {"terminated_any": "terminated", "truncated_any": "truncated"}
+        rows += episodes.rename_columns([names.get(name, name) for name in episodes.column_names]).to_pylist()
+    return rows
+
+
+def table_bytes(rows: Sequence[Mapping[str, Any]]) -> bytes:
+    """A small table as a file; a column of None becomes one of numbers, as it is where they are known."""
+    import pyarrow
+    from pyarrow import parquet
+
+    made = pyarrow.BufferOutputStream()
+    table = pyarrow.Table.from_pylist(list(rows))
+    known = [
+        field.with_type(pyarrow.float64()) if pyarrow.types.is_null(field.type) else field
+        for field in table.schema
+    ]
+    parquet.write_table(table.cast(pyarrow.schema(known)), made, compression=SETTINGS["compression"])
+    return bytes(made.getvalue())
+
+
+def dataset_root(file: Path) -> str:
+    """The root of the dataset that an exported file is from."""
+    from pyarrow import parquet
+
+    metadata = parquet.read_schema(file).metadata or {}
+    return str(json.loads(metadata[METADATA_KEY.encode()])["dataset_root"])
 
 
 def _lists(rows: npt.NDArray[np.float32]) -> "pyarrow.Array":

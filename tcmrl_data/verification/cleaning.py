@@ -14,6 +14,7 @@ from tcmrl_data.building.work_files import (
     WORK_FILES,
     WORK_FOLDERS,
     check_work_files,
+    is_viewer_file,
 )
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.disk import (
@@ -190,7 +191,7 @@ def _is_own(file: str, mode: int) -> bool:
     if stat.S_ISLNK(mode) and is_part_folder(file):
         return True
     return stat.S_IFMT(mode) in (stat.S_IFREG, stat.S_IFLNK) and (
-        file in {MANIFEST, *TABLES, *CROISSANT_FILES} or key_of_file(file) is not None
+        file in {MANIFEST, *TABLES, *CROISSANT_FILES} or is_viewer_file(file) or key_of_file(file) is not None
     )
 
 

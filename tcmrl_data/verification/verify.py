@@ -12,7 +12,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.building.work_files import DESCRIPTIONS
+from tcmrl_data.building.work_files import DESCRIPTIONS, is_viewer_file
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.selection import is_view_file
 from tcmrl_data.foundation.disk import LOCK, lock_holder
@@ -200,7 +200,9 @@ class _Verification:
         of_copy = copy_problem(self._folder)
         if of_copy and not self._is_written:
             self._add(MANIFEST_COPY, of_copy)
-        self._check_odd_and_foreign({MANIFEST, TASKS, PARTS_TABLE, *DESCRIPTIONS, *entries, *unnamed})
+        viewer = filter(is_viewer_file, self.scan.files)
+        described = {MANIFEST, TASKS, PARTS_TABLE, *DESCRIPTIONS, *viewer}
+        self._check_odd_and_foreign(described | {*entries, *unnamed})
         return len(entries)
 
     def replay(self, number: int) -> tuple[Replay, ...]:
