@@ -9,6 +9,7 @@ import click
 from tcmrl_data.foundation.errors import TierError
 from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.records import write_ranges
 
 from .frame import fail_incomplete, output_options, print_json, remark
 from .options import (
@@ -126,7 +127,7 @@ def derive(
         several = ("out", "view", "folds", "seed", "names", "dry_run")
         allow_only(context, "--folds" if folds else "--episodes N,M", *several, *["episodes"] * (not folds))
         made = _split(dataset, out, view, folds, seed, numbers, names, dry_run)
-        _print(made, as_json=as_json, dry_run=dry_run)
+        _print(made, as_json=as_json, dry_run=dry_run, are_folds=folds is not None)
         return
     if names is not None:
         raise click.UsageError("--names is for several datasets, of --folds K or --episodes N,M.")
@@ -432,7 +433,7 @@ def relabel(
     click.echo(f"{printable(str(report.dataset))}: {counts} in {len(report.runs)} runs{end}")
 
 
-def _print(datasets: "list[Derived]", *, as_json: bool, dry_run: bool) -> None:
+def _print(datasets: "list[Derived]", *, as_json: bool, dry_run: bool, are_folds: bool = False) -> None:
     """Prints what was made, or would be."""
     if as_json:
         print_json({"dry_run": dry_run, "datasets": list(map(dataclasses.asdict, datasets))})
@@ -443,9 +444,10 @@ def _print(datasets: "list[Derived]", *, as_json: bool, dry_run: bool) -> None:
         cut = f", {made.cut:,} of them cut" if made.cut else ""
         root = f"; root {made.root[:12]}" if made.root else ""
         would = "would have " if dry_run else ""
+        tests = f" (test {write_ranges(made.test_tasks)})" if are_folds else ""
         most = " at most" if dry_run and made.cut else ""
+        sources = ", ".join(source[:12] for source in made.sources)
         click.echo(
-            f"{printable(str(made.out))}: {would}{made.parts:,} parts{cut}, {made.tasks:,} tasks, {span}, "
-            f"{size(made.bytes)}{most}{root}, "
-            f"derived from {', '.join(source[:12] for source in made.sources)}"
+            f"{printable(str(made.out))}: {would}{made.parts:,} parts{cut}, {made.tasks:,} tasks{tests}, "
+            f"{span}, {size(made.bytes)}{most}{root}, derived from {sources}"
         )

@@ -98,7 +98,7 @@ def _value(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}…"
 
 
-UNITS = {"reading": "parts", "playing": "episodes", "filming": "episodes"}
+UNITS = {"reading": "parts", "playing": "episodes", "filming": "episodes", "drawing": "figures"}
 NOTHING_KEPT = "nothing was written; run the same command again"
 
 
@@ -151,8 +151,6 @@ def dataset_report(
     opened = tcmrl_data.open_dataset(dataset)
     place = opened.path if opened.path.name not in ("", "..") else opened.path.resolve()
     target = out or place.with_name(f"{place.stem if place.is_file() else place.name}-report.html")
-    if not target.parent.is_dir():
-        raise click.ClickException(f"--out {target}: the folder {target.parent} does not exist; create it")
     with stopped_by_signals(lambda: NOTHING_KEPT), StageProgress() as progress:
         tcmrl_data.report_dataset(
             opened,

@@ -74,8 +74,24 @@ FORMAT_NAME = PluginName("tcmrl.formats", "format")
 READER_NAME = PluginName("tcmrl.readers", "import format")
 ALGORITHM_NAME = PluginName("tcmrl.algorithms", "algorithm")
 
+
+@final
+class WrittenFile(click.Path):
+    """A file to write, whose folder exists: a typing error in its name makes no folder."""
+
+    def __init__(self) -> None:
+        super().__init__(path_type=Path, dir_okay=False)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        file = Path(super().convert(value, param, ctx))
+        if not file.parent.is_dir():
+            name = param.opts[0] if param else "--out"
+            raise click.ClickException(f"{name} {file}: the folder {file.parent} does not exist; create it")
+        return file
+
+
 PATH = click.Path(path_type=Path)
-FILE = click.Path(path_type=Path, dir_okay=False)
+FILE = WrittenFile()
 COUNT = click.IntRange(min=1)
 INDEX = click.IntRange(min=0)
 

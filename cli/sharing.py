@@ -9,7 +9,7 @@ from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import printable
 
 from .frame import QUIET_OPTION, output_options, print_json, remark
-from .options import DATASET, DRY_RUN, FORMAT_NAME, PATH, SNAPSHOTS, SPLIT, TASKS, TIER, indices
+from .options import DATASET, DRY_RUN, FILE, FORMAT_NAME, PATH, SNAPSHOTS, SPLIT, TASKS, TIER, indices
 from .progress import PartsProgress, with_progress
 
 if TYPE_CHECKING:
@@ -156,6 +156,8 @@ def card(dataset: Path, form: str, out: Path | None, viewer: bool) -> None:
         file = write_croissant(opened, out)
         click.echo(f"{printable(str(file))}: {len(opened.tasks):,} tasks, {len(opened.parts):,} parts")
         return
+    if out is not None:
+        FILE.convert(out, None, None)
     if form == "readme" and out is not None:
         file = out
 

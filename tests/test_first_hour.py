@@ -1,14 +1,18 @@
 """What users stumbled over in their first hour: messages that name the cause, and numbers that are true."""
 
+import itertools
 import json
 import os
+import re
 import shlex
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from tcmrl_cli import making
 from tcmrl_cli.data import data
 from tcmrl_cli.frame import footnotes
@@ -16,8 +20,10 @@ from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import train_run
+from tcmrl_algo.algorithms.core.settings import RunSettings
+from tcmrl_algo.evaluation.evaluate import FinalEpisodes, PathPlot
 from tcmrl_data import BuildReport, Dataset, list_datasets, open_dataset
-from tcmrl_data.foundation.disk import named_errors
+from tcmrl_data.foundation.disk import disk, named_errors
 from tcmrl_data.foundation.errors import BuildError, SelectionError, StorageError
 from tests.commands import Call, assert_refused, in_process
 from tests.graded import graded_dataset, graded_recipe
@@ -148,7 +154,7 @@ def test_a_plan_on_a_busy_machine_says_so(
     call: Call, monkeypatch: pytest.MonkeyPatch, in_process: None
 ) -> None:
     monkeypatch.setattr("tcmrl_data.building.forecast.UPDATE_SECONDS", 0.1)
-    command = ("build", "ml1/reach", "--plan", "--behavior", "scripted", "--tasks", "0", "--profile", "quick")
+    command = ("build", "point-robot", "--plan", "--tasks", "0", "--profile", "quick")
     for load, is_said in ((making.available_cores() * 3.0, True), (0.0, False)):
         monkeypatch.setattr(os, "getloadavg", lambda load=load: (load, 0.0, 0.0))
         code, _, errors = call(*command)
@@ -171,3 +177,71 @@ def test_wrong_tasks_and_splits_are_named_and_a_dataset_says_what_it_is(graded: 
         graded.select(split="tets")  # type: ignore[arg-type]
     assert repr(graded) == f"<Dataset '{graded.folder}': point-robot, 7 tasks, 35 parts>"
     assert repr(open_dataset(graded.folder)) == repr(graded)
+
+
+def test_folds_are_told_apart_by_their_test_tasks(graded: Dataset, call: Call, tmp_path: Path) -> None:
+    printed = call("derive", graded.folder, "--folds", 2, "--view", tmp_path / "folds", "--quiet")[1]
+    tests = re.findall(r"7 tasks \(test ([0-9,-]+)\)", printed)
+    assert len(set(tests)) == 2, printed
+
+
+@pytest.mark.parametrize("form", ["readme", "bibtex"])
+def test_a_card_names_its_file_and_makes_no_folder(
+    graded: Dataset, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, form: str
+) -> None:
+    command = ("card", graded.folder, "--format", form, "--out")
+    assert_refused(call(*command, tmp_path / "nope" / "card"), "nope does not exist")
+    assert list(tmp_path.iterdir()) == []
+
+    def refuse(path: Path, data: bytes) -> None:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(disk, "write", refuse)
+    monkeypatch.setattr(Path, "write_text", lambda path, *_, **__: refuse(path, b""))
+    code, _, errors = call(*command, tmp_path / "card")
+    assert (code, f"{tmp_path / 'card'}: Permission denied" in errors) == (2, True), errors
+
+
+def test_a_report_shows_progress_until_its_last_figure(graded: Dataset, tmp_path: Path) -> None:
+    pytest.importorskip("plotly", reason="plotly is not installed: pip install 'tcmrl[report]'")
+    seen: dict[str, list[tuple[int, int]]] = {}
+    tcmrl_data.report_dataset(
+        graded,
+        tmp_path / "page.html",
+        progress=lambda stage, done, total: seen.setdefault(stage, []).append((done, total)),
+    )
+    assert list(seen) == ["reading", "drawing"]
+    total = len(seen["drawing"])
+    assert seen["drawing"] == [(done, total) for done in range(1, total + 1)]
+    assert (tmp_path / "page.html").read_text().count("<figure") == total
+
+
+@pytest.mark.parametrize("measure", ["rewards", "coverage"])
+def test_nothing_in_a_picture_touches_the_next_axes(
+    graded: Dataset, call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, measure: str
+) -> None:
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    assert call("inspect", measure, graded.folder, "--plot", tmp_path / "x.png", "--quiet")[0] == 0
+    (figure,) = figures
+    figure.draw_without_rendering()
+    boxes = [axes.get_tightbbox() for axes in figure.axes]
+    gaps = [max(b.x0 - a.x1, a.x0 - b.x1) for a, b in itertools.combinations(boxes, 2)]
+    assert all(gap > 5 for gap in gaps), gaps
+    assert all(figure.bbox.x0 <= box.x0 and box.x1 <= figure.bbox.x1 for box in boxes)
+
+
+@pytest.mark.parametrize("end", [0.0, 0.02, 0.1])
+def test_titles_of_paths_do_not_touch(
+    graded: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, end: float
+) -> None:
+    figures = []
+    monkeypatch.setattr(Figure, "savefig", lambda figure, *_, **__: figures.append(figure))
+    (episode, *_) = graded.trajectories(0, graded.parts.keys_of(0)[-1].step)
+    path = replace(episode, observations=np.linspace((0.0, -end), (1.0, 1.0), len(episode.observations)))
+    episodes = {task.index: [path] for task in graded.test_tasks}
+    PathPlot(tmp_path / "x.png", graded, RunSettings())(FinalEpisodes(episodes, episodes))
+    (figure,) = figures
+    figure.draw_without_rendering()
+    assert figure.texts[0].get_window_extent().y0 > max(axes.get_tightbbox().y1 for axes in figure.axes)
+    assert min(axes.get_tightbbox().y0 for axes in figure.axes) > 0

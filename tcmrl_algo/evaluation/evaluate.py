@@ -147,7 +147,7 @@ class PathPlot:
         from matplotlib.colors import to_hex
         from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(2 * PANEL, 0.62 * PANEL), layout="constrained")
+        figure = Figure(figsize=(2 * PANEL, PANEL), layout="compressed")
         FigureCanvasAgg(figure)
         panels = figure.subplots(1, 2, sharex=True, sharey=True)
         name = self._settings.algorithm
@@ -162,7 +162,7 @@ class PathPlot:
             axes.set(title=title, xlabel="x")
         panels[0].set_ylabel("y")
         figure.suptitle(f"{self._dataset.name}: paths in {len(episodes.adapted)} test tasks")
-        figure.savefig(self._file, dpi=110)
+        figure.savefig(self._file, dpi=110, bbox_inches="tight")
 
 
 MOST_OTHERS = 3

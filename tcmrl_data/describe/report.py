@@ -1,5 +1,6 @@
 """The report on a dataset: one HTML file, to be read in a browser or printed."""
 
+import itertools
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,6 +19,9 @@ from tcmrl_data.foundation.plain_files import printable
 
 EPISODES = 20
 """Whole episodes of a report."""
+
+ALWAYS_DRAWN = 9
+"""Figures of every report."""
 
 LISTED_TASKS = 1000
 """Tasks of the table of tasks; `inspect tasks` prints all."""
@@ -64,12 +68,16 @@ def report_dataset(
     content = measure(dataset, browsed=episodes, transfer=transfer, strips=strips, progress=progress)
     out = Path(out)
     make_folders(out.parent)
-    replace_file(out, report_html(content).encode())
+    replace_file(out, report_html(content, progress).encode())
     return out
 
 
-def report_html(content: Content) -> str:
+def report_html(content: Content, progress: StageProgress | None = None) -> str:
     """The page of a report.
+
+    Args:
+        content: what it shows.
+        progress: called after every figure, which takes longer than reading a small dataset.
 
     Raises:
         RenderingError: plotly is not installed.
@@ -82,6 +90,16 @@ def report_html(content: Content) -> str:
     returns = summarize_returns(content.returns)
     columns = ["step", "split", "tasks", "episodes", "mean", "std", "min", "max", "success_rate"]
     columns = columns if any(row["success_rate"] is not None for row in returns) else columns[:-1]
+    is_scored = any(task.snapshots and task.snapshots[0].tq is not None for task in content.quality.tasks)
+    has_overlap = len(content.coverage.overlap.tasks) > 1
+    num_figures = ALWAYS_DRAWN + is_scored + has_overlap + (content.transfer is not None)
+    drawn = itertools.count(1)
+
+    def count_figure() -> str:
+        if progress is not None:
+            progress("drawing", next(drawn), num_figures)
+        return ""
+
     differences = ("parameter", "train", "test", "difference", "standardized")
     values = {
         "content": content,
@@ -89,9 +107,9 @@ def report_html(content: Content) -> str:
         "verdicts": judge(content),
         "return_columns": columns,
         "return_rows": [[row[column] for column in columns] for row in returns],
-        "is_scored": any(
-            task.snapshots and task.snapshots[0].tq is not None for task in content.quality.tasks
-        ),
+        "is_scored": is_scored,
+        "has_overlap": has_overlap,
+        "count_figure": count_figure,
         "tier_rows": list(tier_rows(content.quality)),
         "ending_rows": list(_ending_rows(content)),
         "shift_rows": [[row[name] for name in differences] for row in content.tasks["shift"]],

@@ -133,7 +133,8 @@ def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> Non
     with named_errors(path):
         for temporary in places:
             try:
-                write_file(temporary, data)
+                disk.write(temporary, data)
+                disk.sync(temporary)
                 disk.rename(temporary, path)
                 break
             except OSError as error:

@@ -39,6 +39,7 @@ class Derived:
         cut: number of parts among them that were made anew.
         bytes: size of the archives; before parts are cut, that of the whole parts.
         tasks: number of tasks.
+        test_tasks: indices of those that are test tasks.
         steps: snapshot steps that occur.
         label: the dataset's own name.
         root: None where it is not known, as before parts are cut.
@@ -51,6 +52,7 @@ class Derived:
     cut: int
     bytes: int
     tasks: int
+    test_tasks: tuple[int, ...]
     steps: tuple[int, ...]
     label: str | None
     root: str | None
@@ -148,6 +150,7 @@ def summary(plan: Plan, out: Path, *, root: str | None, far: dict[str, float] | 
         cut=plan.num_cut,
         bytes=plan.bytes if root is None or out.is_file() else read_manifest(out).totals.bytes,
         tasks=len(plan.tasks),
+        test_tasks=tuple(task.index for task in plan.tasks if task.split == "test"),
         steps=tuple(sorted({part.key.step for part in plan.parts})),
         label=plan.label,
         root=root,

@@ -212,6 +212,7 @@ def new_figure(width: float, height: float) -> "Figure":
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
+    figure.get_layout_engine().set(w_pad=0.12)  # a color bar's label keeps off the next axes
     FigureCanvasAgg(figure)
     return figure
 
