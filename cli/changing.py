@@ -9,7 +9,6 @@ import click
 from tcmrl_data.foundation.errors import TierError
 from tcmrl_data.foundation.machine import size
 from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.records import write_ranges
 
 from .frame import fail_incomplete, output_options, print_json, remark
 from .options import (
@@ -438,6 +437,8 @@ def _print(datasets: "list[Derived]", *, as_json: bool, dry_run: bool, are_folds
     if as_json:
         print_json({"dry_run": dry_run, "datasets": list(map(dataclasses.asdict, datasets))})
         return
+    from tcmrl_data.foundation.records import write_ranges
+
     for made in datasets:
         steps = made.steps
         span = f"step {steps[0]:,}" if len(steps) == 1 else f"steps {steps[0]:,} to {steps[-1]:,}"

@@ -1,5 +1,6 @@
 """Options that several commands take alike, and the types of their values."""
 
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeVar, final
@@ -83,7 +84,8 @@ class WrittenFile(click.Path):
         super().__init__(path_type=Path, dir_okay=False)
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        file = Path(super().convert(value, param, ctx))
+        file = Path(os.fspath(value))
+        super().convert(file, param, ctx)
         if not file.parent.is_dir():
             name = param.opts[0] if param else "--out"
             raise click.ClickException(f"{name} {file}: the folder {file.parent} does not exist; create it")

@@ -210,9 +210,10 @@ def new_figure(width: float, height: float) -> "Figure":
     """An empty figure of so many inches, which opens no window."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
+    from matplotlib.layout_engine import ConstrainedLayoutEngine
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    figure.get_layout_engine().set(w_pad=0.12)  # a color bar's label keeps off the next axes
+    layout = ConstrainedLayoutEngine(w_pad=0.12)  # so that a color bar's label keeps off the next axes
+    figure = Figure(figsize=(width, height), layout=layout)
     FigureCanvasAgg(figure)
     return figure
 
