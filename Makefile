@@ -35,7 +35,7 @@ $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(INSTALLED_TEST): $(INSTALLED)
-	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[docs,minari,parquet,ray,report,tensordict,test,tune]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[docs,minari,parquet,ray,remote,report,tensordict,test,tune]'
 	@touch $@
 
 $(INSTALLED_DOCS): $(INSTALLED)

@@ -27,7 +27,9 @@ from .keeping import cache, delete, verify
 from .looking import dataset_report, diff, render
 from .making import build, import_data, import_policy
 from .new import new
-from .options import DATASET, PATH
+from .options import DATASET
+from .places import DATASET_PATH
+from .remote import pull, push
 from .sharing import card, export
 
 if TYPE_CHECKING:
@@ -87,18 +89,21 @@ def envs(as_json: bool) -> None:
 
 
 @click.command(name="list")
-@click.argument("folder", type=PATH, required=False)
+@click.argument("folder", type=DATASET_PATH, required=False)
 @output_options
-def list_(folder: Path | None, as_json: bool) -> None:
+def list_(folder: Path | str | None, as_json: bool) -> None:
     """List the datasets and views in FOLDER (default: data) and its subfolders.
 
+    FOLDER may be an address, such as a bucket: then each dataset is listed, and each of its tags.
+
     \b
-    Example:
+    Examples:
       tcmrl-data list data --json
+      tcmrl-data list s3://bucket
     """
     import tcmrl_data
 
-    if folder is not None and not folder.is_dir():
+    if isinstance(folder, Path) and not folder.is_dir():
         raise click.ClickException(f"{folder} is not a folder; name a folder that contains datasets")
     folder = folder or Path("data")
     rows = tcmrl_data.list_datasets(folder)
@@ -162,13 +167,19 @@ def show(dataset: Path, as_json: bool) -> None:
     for name, value in rows.items():
         table.add_row(name, printable(value))
     print_table(table)
+    place = str(opened.path)
     if not document["complete"]:
         remark(f"Next: run the `tcmrl-data build {document['name']}` command of this dataset again")
+    elif opened.remote is not None:
+        next_commands(
+            ["tcmrl-data", "inspect", "returns", place],
+            ["tcmrl-data", "pull", place, "FOLDER"],
+        )
     else:
         next_commands(
-            ["tcmrl-data", "inspect", "returns", opened.path],
-            ["tcmrl-data", "verify", opened.path],
-            ["tcmrl", "train", opened.path],
+            ["tcmrl-data", "inspect", "returns", place],
+            ["tcmrl-data", "verify", place],
+            ["tcmrl", "train", place],
         )
 
 
@@ -214,6 +225,6 @@ data.fill(
         "Look": [envs, list_, show, inspect, diff, dataset_report, render],
         "Change": [derive, merge, extend, relabel],
         "Keep": [verify, delete, cache],
-        "Share": [export, card],
+        "Share": [export, push, pull, card],
     }
 )

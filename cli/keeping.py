@@ -373,16 +373,24 @@ def verify_cache(as_json: bool) -> None:
 
 
 @click.command(name="clear")
+@click.option("--fetched", is_flag=True, help="Remove the parts and tables of datasets at addresses instead.")
 @output_options
-def clear_cache(as_json: bool) -> None:
+def clear_cache(fetched: bool, as_json: bool) -> None:
     """Remove all entries that no process is using.
 
     \b
-    Example:
+    Examples:
       tcmrl-data cache clear
+      tcmrl-data cache clear --fetched
     """
     import tcmrl_data
 
+    if fetched:
+        num_bytes = tcmrl_data.clear_fetched()
+        print_json({"bytes": num_bytes}) if as_json else click.echo(
+            f"fetched data removed, {size(num_bytes)}"
+        )
+        return
     removed = tcmrl_data.clear_cache()
     kept = tcmrl_data.list_cache()
     if as_json:

@@ -12,7 +12,7 @@ from tcmrl_data.foundation.plain_files import printable
 
 from .frame import INCOMPLETE, number, output_options, print_json, remark, stopped_by_signals
 from .options import DATASET, FILE, INDEX
-from .places import DATASET_PATH
+from .places import DATASET_PATH, beside
 from .progress import StageProgress
 
 if TYPE_CHECKING:
@@ -149,8 +149,7 @@ def dataset_report(
     import tcmrl_data
 
     opened = tcmrl_data.open_dataset(dataset)
-    place = opened.path if opened.path.name not in ("", "..") else opened.path.resolve()
-    target = out or place.with_name(f"{place.stem if place.is_file() else place.name}-report.html")
+    target = out or beside(opened.path, "-report.html")
     with stopped_by_signals(lambda: NOTHING_KEPT), StageProgress() as progress:
         tcmrl_data.report_dataset(
             opened,

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import os
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -43,7 +44,7 @@ from .places import complete_environments, complete_recipe_keys
 from .progress import StageProgress, with_progress
 
 if TYPE_CHECKING:
-    from tcmrl_data import BuildEvent, BuildPlan, Recipe
+    from tcmrl_data import BuildEvent, BuildPlan, Dataset, Recipe
 
 
 BUSY_SHARE = 0.25
@@ -102,6 +103,11 @@ BUSY_SHARE = 0.25
     show_default=True,
     help="Least time between two checkpoints of behavior training; 0 for as many as possible.",
 )
+@click.option(
+    "--expect-root",
+    metavar="ROOT|DATASET",
+    help="Root of a published dataset, or its folder or address: say whether the build is equal to it.",
+)
 @output_options
 @click.pass_context
 def build(
@@ -120,6 +126,7 @@ def build(
     engine: str,
     ray_address: str | None,
     checkpoint_every: float,
+    expect_root: str | None,
     as_json: bool,
 ) -> None:
     """Build a dataset, or the missing parts of one.
@@ -133,6 +140,9 @@ def build(
     the command adds tasks to the dataset. The parts of tasks in --drop-tasks stay on disk but no longer
     belong to the dataset, until a build names the tasks in --tasks.
 
+    With --expect-root the exit code is 1 if the root is not the published one. Of a published dataset the
+    first part that differs is named, and why: builds on other processors or packages may differ.
+
     \b
     Examples:
       tcmrl-data build point-robot --profile quick
@@ -142,8 +152,10 @@ def build(
       tcmrl-data build ml1/reach --set rollouts.episodes=20
       tcmrl-data build point-robot --drop-tasks 6
       tcmrl-data build my-recipe.toml --profile quick
+      tcmrl-data build point-robot --expect-root s3://bucket/point-robot
     """
     import tcmrl_data
+    from tcmrl_data.dataset.diff import why_not_published
 
     if as_recipe:
         allow_only(context, "--recipe", "profile", "overrides")
@@ -160,6 +172,7 @@ def build(
         allow_only(context, "--plan", "profile", "overrides", "behavior", "tasks", "workers")
         _print_plan(tcmrl_data.plan_build(recipe, tasks=chosen), workers=workers, as_json=as_json)
         return
+    expected = None if expect_root is None else _published(expect_root)
     dropped = drop_tasks and tcmrl_data.parse_indices(drop_tasks, limit, option="--drop-tasks")
     out = out or Path("data") / recipe.environment.name
     is_new = not as_json and not (out / "manifest.json").exists()
@@ -195,6 +208,18 @@ def build(
     if report.failed:
         more = "" if len(report.failed) == 1 else f" (and {len(report.failed) - 1} more)"
         fail_incomplete(f"{report.failed[0]}{more}; run the same command again to build the missing parts")
+    elif expected is not None:
+        problem = why_not_published(out, expected)
+        if problem is not None:
+            fail_incomplete(problem)
+        remark("root as published")
+
+
+def _published(text: str) -> "str | Dataset":
+    """The root that is expected, or the dataset that has it, which is opened before anything is built."""
+    import tcmrl_data
+
+    return text if re.fullmatch("[0-9a-f]{12,64}", text) else tcmrl_data.open_dataset(text)
 
 
 def show_build(event: "BuildEvent", progress: StageProgress) -> None:

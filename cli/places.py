@@ -10,13 +10,16 @@ import os
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, final
+from typing import TYPE_CHECKING, Any
 
 import click
 from click.shell_completion import CompletionItem
 
 from tcmrl_data.foundation.canonical import leaves
 from tcmrl_data.foundation.plugins import declared_names
+
+if TYPE_CHECKING:
+    from tcmrl_data import Address
 
 MANIFEST_FILE, RUN_FILE = "manifest.json", "run.json"
 MAX_FOLDERS = 10_000
@@ -26,7 +29,6 @@ NO_ENVIRONMENT = "foreign"
 """The declared environment that has no recipe."""
 
 
-@final
 class MarkedFolder(click.Path):
     """A path, completed by the folders that hold a file of a name.
 
@@ -48,8 +50,23 @@ class MarkedFolder(click.Path):
         return items or super().shell_complete(ctx, param, incomplete)
 
 
-DATASET_PATH = MarkedFolder(MANIFEST_FILE, "data")
+class DatasetPath(MarkedFolder):
+    """The folder of a dataset, a view's file, or an address, which is text."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return value if isinstance(value, str) and "://" in value else super().convert(value, param, ctx)
+
+
+DATASET_PATH = DatasetPath(MANIFEST_FILE, "data")
 RUN_PATH = MarkedFolder(RUN_FILE, "runs", "results")
+
+
+def beside(place: "Path | Address", ending: str) -> Path:
+    """The path of something made of a dataset: beside it, or in the current folder if it is at an address."""
+    if not isinstance(place, Path):
+        return Path(f"{place.name}{ending}")
+    place = place if place.name not in ("", "..") else place.resolve()
+    return place.with_name(f"{place.stem if place.is_file() else place.name}{ending}")
 
 
 def _marked(place: str, mark: str) -> Iterator[str]:

@@ -10,6 +10,7 @@ from tcmrl_data.foundation.plain_files import printable
 
 from .frame import QUIET_OPTION, output_options, print_json, remark
 from .options import DATASET, DRY_RUN, FILE, FORMAT_NAME, PATH, SNAPSHOTS, SPLIT, TASKS, TIER, indices
+from .places import beside
 from .progress import PartsProgress, with_progress
 
 if TYPE_CHECKING:
@@ -55,8 +56,7 @@ def export(
     from tcmrl_data.interchange.exporting import staging_folder
 
     opened = tcmrl_data.open_dataset(dataset)
-    place = opened.path if opened.path.name not in ("", "..") else opened.path.resolve()
-    target = out or place.with_name(f"{place.stem if place.is_file() else place.name}-{format_name}")
+    target = out or beside(opened.path, f"-{format_name}")
 
     def work(progress: PartsProgress) -> tcmrl_data.ExportReport:
         return tcmrl_data.export_dataset(
@@ -149,7 +149,7 @@ def card(dataset: Path, form: str, out: Path | None, viewer: bool) -> None:
     opened = tcmrl_data.open_dataset(dataset)
     if out is None and opened.path != opened.folder and (viewer or form == "croissant"):
         kind = "a README.md" if viewer else "one"
-        raise click.UsageError(f"{dataset} is a view, which has no folder; name {kind} by --out")
+        raise click.UsageError(f"{dataset} is no folder; name {kind} by --out")
     if viewer and out is None:
         out = opened.folder / "README.md"
     if form == "croissant":

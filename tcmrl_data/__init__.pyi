@@ -19,6 +19,7 @@ from .dataset.listing import list_returns as list_returns
 from .dataset.selection import TIERS as TIERS
 from .dataset.selection import Selection as Selection
 from .dataset.selection import is_view_file as is_view_file
+from .describe.publish import push_dataset as push_dataset
 from .describe.render import Rendered as Rendered
 from .describe.render import render_episode as render_episode
 from .describe.report import report_dataset as report_dataset
@@ -52,6 +53,8 @@ from .foundation.errors import SelectionError as SelectionError
 from .foundation.errors import TcmrlError as TcmrlError
 from .foundation.errors import TierError as TierError
 from .foundation.errors import TrainingError as TrainingError
+from .foundation.machine import cache_folder as cache_folder
+from .foundation.machine import cache_limit as cache_limit
 from .foundation.machine import parse_bytes as parse_bytes
 from .foundation.seeding import NO_TASK as NO_TASK
 from .foundation.seeding import Purpose as Purpose
@@ -71,6 +74,8 @@ from .operations.derive import rename_dataset as rename_dataset
 from .operations.extend import ExtendReport as ExtendReport
 from .operations.extend import extend_dataset as extend_dataset
 from .operations.merge import merge_datasets as merge_datasets
+from .operations.pull import PullReport as PullReport
+from .operations.pull import pull_dataset as pull_dataset
 from .operations.relabel import RelabelReport as RelabelReport
 from .operations.relabel import relabel_dataset as relabel_dataset
 from .operations.split import split_dataset as split_dataset
@@ -92,9 +97,11 @@ from .recipe.recipe import load_recipe as load_recipe
 from .recipe.recipe import parse_indices as parse_indices
 from .recipe.values import list_environments as list_environments
 from .recipe.values import recipe_values as recipe_values
+from .remote.address import Address as Address
+from .remote.address import is_url as is_url
+from .remote.files import clear_fetched as clear_fetched
+from .remote.local import PushReport as PushReport
 from .sampling.cache import CacheEntry as CacheEntry
-from .sampling.cache import cache_folder as cache_folder
-from .sampling.cache import cache_limit as cache_limit
 from .sampling.cache import clear_cache as clear_cache
 from .sampling.cache import list_cache as list_cache
 from .sampling.cache import verify_cache as verify_cache

@@ -39,6 +39,8 @@ MEANINGS = {
     "--environment": "an environment",
     "--episode": "the number of an episode",
     "--episodes": "how many episodes",
+    "--expect-root": "the root that the build should have",
+    "--fetched": "what was fetched from addresses",
     "--first-episode": "the number of the first episode",
     "--first-task": "the index of the first file's task",
     "--folds": "a number of folds of the tasks",
@@ -54,6 +56,7 @@ MEANINGS = {
     "--max-tasks": "most tasks that take part",
     "--memory-limit": "most memory for data",
     "--min-return": "the least return of an episode",
+    "--move": "let a tag name another dataset",
     "--names": "names of several datasets",
     "--noise": "the standard deviation of noise on actions",
     "--observation": "which observation a policy reads",
@@ -90,6 +93,7 @@ MEANINGS = {
     "--stop-at": "the training step to stop at; schedules stay",
     "--strict": "what else is a warning or a note is an error",
     "--strips": "a number of episodes to draw",
+    "--tag": "a name for a state of a dataset",
     "--task": "the index of a task",
     "--task-file": "a file that describes tasks",
     "--tasks": "indices of the tasks that are taken",
@@ -103,6 +107,7 @@ MEANINGS = {
     "--url": "where imported data come from",
     "--version": "print the version",
     "--view": "where to write a view",
+    "--viewer": "write Parquet for the viewer of the Hub",
     "--width": "the width of a picture",
     "--workers": "how many processes work at once",
     "--yes": "do not ask",
@@ -151,7 +156,7 @@ def test_the_argument_is_called_dataset_everywhere() -> None:
     }
     assert {metavar for name, metavar in named if name in ("dataset", "left")} == {"DATASET"}
     assert {metavar for _, metavar in named} == {
-        *("DATASET", "OTHER", "DATASET…", "ENV|FILE", "FORMAT", "FILE…", "ZIP", "[FOLDER]"),
+        *("DATASET", "OTHER", "DATASET…", "ENV|FILE", "URL", "OUT", "FORMAT", "FILE…", "ZIP", "[FOLDER]"),
         *("RUN", "RUNS...", "FILE|NAME", "NAME"),
     }
 

@@ -12,6 +12,7 @@ from tcmrl_cli.data import data
 import tcmrl_data
 from tcmrl_data import Dataset, derive_dataset, diff_datasets, extend_dataset, open_dataset
 from tcmrl_data.behavior.base import Snapshot
+from tcmrl_data.dataset.diff import why_not_published
 from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.operations.assembly import PlannedPart, derivation_of, open_assembly
@@ -19,6 +20,7 @@ from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.tables import PartKey
 from tests.commands import assert_refused, in_process
+from tests.conftest import TINY
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
@@ -174,3 +176,35 @@ def test_command_line(tiny: Dataset, tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "parts         5 equal, 0 differ, 10 left only, 0 right only" in output
     assert call("diff", tiny.folder, tmp_path / "less", "--json")[0] == 1
     assert_refused(call("diff", tiny.folder, tmp_path / "none"), "does not exist")
+
+
+def test_a_build_says_whether_its_root_is_the_published_one(
+    tiny: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = tiny.manifest.root
+    assert why_not_published(tiny, root) is why_not_published(tiny, root[:12]) is None
+    assert why_not_published(tiny, open_dataset(tiny.folder)) is None
+    assert f"has root {root[:12]}, and 000000000000 was published" in str(why_not_published(tiny, "0" * 64))
+    other = changed(tiny, tmp_path / "other", other_reward)
+    assert f"the first part that differs is {KEY}: " in str(why_not_published(other, tiny))
+    derive_dataset(tiny, tmp_path / "less", tasks=[0, 3])
+    assert "it lacks 9 parts, first task 40" in str(why_not_published(tmp_path / "less", tiny))
+    call = in_process(data, capsys)
+    settings = [word for value in TINY for word in ("--set", value)]
+    build = (
+        "build",
+        "point-robot",
+        "--profile",
+        "quick",
+        *settings,
+        "--tasks",
+        "0",
+        "--out",
+        tmp_path / "built",
+    )
+    code, _, errors = call(*build, "--expect-root", tiny.folder)
+    assert code == 1 and "it lacks 12 parts, first task 3" in errors
+    built = open_dataset(tmp_path / "built").manifest.root
+    code, _, errors = call(*build, "--expect-root", built)
+    assert code == 0 and "root as published" in errors
+    assert_refused(call(*build, "--expect-root", tmp_path / "nothing"), "does not exist")

@@ -187,7 +187,7 @@ def tune_method(
             made = run_experiment(
                 trials_experiment(tuning),
                 out,
-                data=view.path,
+                data=view.path_on_disk,
                 only=[_label(number) for number in waiting],
                 overrides=overrides,
                 steps=tuning.steps,

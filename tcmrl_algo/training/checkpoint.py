@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tcmrl_algo.algorithms.core.problem import MomentsRecord
 from tcmrl_algo.algorithms.core.settings import TrainingConfig
-from tcmrl_data import CheckpointError, Dataset, open_dataset
+from tcmrl_data import CheckpointError, Dataset, is_url, open_dataset
 from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import make_folders, publish_folder, remove_abandoned, remove_tree
 from tcmrl_data.foundation.records import Frozen, read_record, record_bytes, write_record
@@ -150,7 +150,7 @@ class Run:
         Raises:
             CheckpointError: it is not where it was, or the path holds another one.
         """
-        if path is None and not Path(self.record.dataset).exists():
+        if path is None and not is_url(self.record.dataset) and not Path(self.record.dataset).exists():
             raise CheckpointError(
                 f"the run in {self.folder} was trained on {self.record.dataset}, where nothing lies now; "
                 "name the dataset's new place with --dataset"

@@ -2,8 +2,9 @@
 
 import contextlib
 import functools
+import itertools
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
@@ -30,6 +31,8 @@ from tcmrl_data.foundation.errors import (
 )
 from tcmrl_data.foundation.plain_files import one_line, read_plain_file
 from tcmrl_data.foundation.records import first_problem
+from tcmrl_data.remote.address import Address, is_url, parse_address
+from tcmrl_data.remote.files import RemoteFiles, open_remote
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.manifest import MANIFEST, Manifest, dataset_folder, read_manifest
@@ -41,21 +44,28 @@ KEPT_RECORDS = 1000
 """Records of parts that stay in memory, about 10 kB each."""
 
 
-def open_dataset(path: str | Path) -> "Dataset":
-    """Opens a dataset, given its folder or its `manifest.json`, or a view file that names parts of one.
+def open_dataset(path: str | Path | Address) -> "Dataset":
+    """Opens a dataset, given its folder, its `manifest.json` or its address, or a view file of one.
 
     Only the manifest is read, and of a view the view and the source's table of tasks. The other tables are
     read when they are first used, and are checked against the manifest; so is a part's archive.
     `verify_dataset` checks everything.
 
+    Of a dataset at an address, such as `s3://bucket/point-robot` or `https://…`, manifest and tables are
+    fetched into the cache, and a part when it is first used; `Dataset.fetch` brings many at a time.
+
     Raises:
         ManifestError: the manifest or the view is missing, truncated, edited or of another version, or the
             view's source is not the dataset that the view was made of.
+        RemoteError: there is no dataset at the address, or its server does not give it.
 
     Example:
         >>> dataset = open_dataset("data/point-robot")  # doctest: +SKIP
         >>> dataset.select(split="train", snapshots="last").trajectories(0)  # doctest: +SKIP
     """
+    if isinstance(path, Address) or is_url(path):
+        remote, manifest = open_remote(parse_address(path))
+        return Dataset(remote.folder, manifest, remote=remote)
     if is_view_file(path):
         return _open_view(Path(path))
     folder = dataset_folder(path)
@@ -85,19 +95,27 @@ class TaskReferences(References):
 
 
 class Dataset:
-    """A dataset on disk, or some of its parts by a view; made by `open_dataset`.
+    """A dataset on disk or at an address, or some of its parts by a view; made by `open_dataset`.
 
     Attributes:
-        folder: where the parts lie.
+        folder: where manifest and tables lie, and the parts unless the dataset is at an address.
         manifest: its manifest; of a view, that of a dataset of the view's parts.
-        path: what `open_dataset` opens: the folder, or the view's file.
+        path: what `open_dataset` opens: the folder, the view's file, or the address.
+        remote: fetches the parts of a dataset at an address; None for one on this disk.
     """
 
     def __init__(
-        self, folder: Path, manifest: Manifest, file: Path | None = None, view: ViewFile | None = None
+        self,
+        folder: Path,
+        manifest: Manifest,
+        file: Path | None = None,
+        view: ViewFile | None = None,
+        remote: RemoteFiles | None = None,
     ) -> None:
-        self.folder, self.manifest, self.path = folder, manifest, folder if file is None else file
-        self._view = view
+        self.folder, self.manifest = folder, manifest
+        self.path: Path | Address = remote.address if remote else folder if file is None else file
+        self._view, self.remote = view, remote
+        self._file = file
         self._records: dict[PartKey, PartRecord] = {}
 
     def __repr__(self) -> str:
@@ -105,9 +123,20 @@ class Dataset:
         tasks, parts = self.manifest.num_tasks, totals.parts
         return f"<Dataset {str(self.path)!r}: {name}, {tasks:,} tasks, {parts:,} parts>"
 
-    def __reduce__(self) -> tuple[type["Dataset"], tuple[Path, Manifest, Path, ViewFile | None]]:
+    def __reduce__(
+        self,
+    ) -> tuple[type["Dataset"], tuple[Path, Manifest, Path | None, ViewFile | None, RemoteFiles | None]]:
         """Another process gets manifest and view, and reads tables and parts by itself."""
-        return Dataset, (self.folder, self.manifest, self.path, self._view)
+        return Dataset, (self.folder, self.manifest, self._file, self._view, self.remote)
+
+    @property
+    def path_on_disk(self) -> Path:
+        """`path`, for what needs the dataset's own files.
+
+        Raises:
+            ManifestError: the dataset is at an address.
+        """
+        return dataset_folder(self.path) if isinstance(self.path, Address) else self.path
 
     @property
     def sealed_root(self) -> str:
@@ -258,8 +287,31 @@ class Dataset:
         return entry
 
     def file_of(self, key: PartKey) -> Path:
-        """The file of a part's archive."""
-        return self.folder / part_file(key)
+        """The file of a part's archive; of a dataset at an address in the cache, where it is fetched to.
+
+        Raises:
+            SelectionError: the dataset has no such part.
+            RemoteError: the part is not in the cache and cannot be fetched.
+        """
+        return self.folder / part_file(key) if self.remote is None else self.remote.file(self.entry(key))
+
+    def fetch(
+        self,
+        parts: Selection | Iterable[PartKey] | None = None,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        """Brings parts of a dataset at an address into the cache, several at a time; else does nothing.
+
+        Args:
+            parts: a selection of this dataset, or keys; all where None.
+            progress: called with bytes that arrived, and bytes in all.
+
+        Raises:
+            RemoteError: a part cannot be fetched; those that arrived stay.
+        """
+        if self.remote is not None:
+            keys = itertools.chain(*parts.parts.values()) if isinstance(parts, Selection) else parts
+            self.remote.fetch(map(self.entry, self.parts if keys is None else keys), progress)
 
     def content(self, key: PartKey) -> bytes:
         """The bytes of a part's archive, compared with the table.

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.foundation.canonical import differences, leaves
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.remote.address import Address
 from tcmrl_data.store.part import STANDARD_ARRAYS, Identity
 from tcmrl_data.store.tables import PartKey
 
@@ -207,8 +208,8 @@ class DatasetDiff:
         first: why the first part that differs does; None if there is none, or it was not looked for.
     """
 
-    left: Path
-    right: Path
+    left: Path | Address
+    right: Path | Address
     roots: tuple[str, str]
     recipe: tuple[Change, ...]
     runs: tuple[Change, ...]
@@ -279,6 +280,38 @@ def diff_datasets(
         if different and reads_parts
         else None,
     )
+
+
+def why_not_published(built: str | Path | Dataset, published: str | Dataset) -> str | None:
+    """Why a dataset does not have a published root, in one line; None if it does.
+
+    Args:
+        built: a dataset.
+        published: a root, of at least 12 digits, or the dataset that it should be equal to: this one's parts
+            then tell the first that differs and why, the platform first.
+
+    Raises:
+        ManifestError: the built dataset cannot be read.
+    """
+    dataset = built if isinstance(built, Dataset) else open_dataset(built)
+    root = dataset.manifest.root
+    expected = published if isinstance(published, str) else published.manifest.root
+    if root.startswith(expected):
+        return None
+    words = f"{dataset.path} has root {root[:12]}, and {expected[:12]} was published"
+    if isinstance(published, str):
+        copy = "`tcmrl-data diff` with a copy of it says why"
+        return f"{words}; {copy}"
+    found = diff_datasets(published, dataset)
+    if found.first is not None:
+        platform = f"made on another platform ({'; '.join(found.first.platform)}), " * bool(
+            found.first.platform
+        )
+        return f"{words}; the first part that differs is {found.first.key}: {platform}{found.first.detail}"
+    for what, keys in (("lacks", found.left_only), ("has besides", found.right_only)):
+        if keys:
+            return f"{words}; it {what} {len(keys)} parts, first {keys[0]}"
+    return words
 
 
 def _recipe(dataset: Dataset) -> dict[str, Any]:

@@ -18,20 +18,31 @@ from tcmrl_data.envs.base import Split, Task, place_in_order
 from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.foundation.canonical import MAX_JSON_BYTES
 from tcmrl_data.foundation.disk import STAGING
-from tcmrl_data.foundation.errors import ManifestError, SelectionError, TcmrlError
+from tcmrl_data.foundation.errors import ManifestError, RemoteError, SelectionError, TcmrlError
 from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.remote.address import Address, is_url, parse_address
+from tcmrl_data.remote.published import find_datasets
 from tcmrl_data.store.manifest import EPISODES, FOLD, MANIFEST, Derivation
 from tcmrl_data.store.part_table import PartEntry
 from tcmrl_data.store.tables import PARTS
 
 
 def list_datasets(root: str | Path) -> list[dict[str, Any]]:
-    """A `dataset_row` for every dataset and view below a folder; `path` and `error` for unreadable ones."""
+    """A `dataset_row` for every dataset and view below a folder or address.
+
+    Unreadable ones have `path` and `error`. Every tag of an address has a row of its own.
+
+    Raises:
+        RemoteError: the server of an address does not answer, or lists nothing.
+    """
     rows: list[dict[str, Any]] = []
-    for path in sorted(_paths(Path(root))):
+    found: Iterable[Path | Address] = (
+        find_datasets(parse_address(root)) if is_url(root) else sorted(_paths(Path(root)))
+    )
+    for path in found:
         try:
             rows.append(dataset_row(open_dataset(path)))
-        except ManifestError as error:
+        except (ManifestError, RemoteError) as error:
             rows.append({"path": str(path), "error": str(error)})
     return rows
 
@@ -66,7 +77,7 @@ def dataset_row(dataset: Dataset) -> dict[str, Any]:
         "behavior": manifest.recipe.behavior.source,
         "seed": manifest.seed,
         "derived": _derived(manifest.derivation),
-        "source": None if dataset.path == dataset.folder else str(dataset.folder),
+        "source": None if dataset.remote or dataset.path == dataset.folder else str(dataset.folder),
         "tasks": manifest.num_tasks,
         "parts": manifest.totals.parts,
         "complete": manifest.complete,

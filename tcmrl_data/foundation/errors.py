@@ -73,6 +73,10 @@ class ReadOnlyError(StorageError):
     """The user may not write to the dataset's folder, or its disk is mounted read-only."""
 
 
+class RemoteError(TcmrlError):
+    """A dataset beyond this disk that cannot be reached, read or written, or is not what it should be."""
+
+
 class CacheError(TcmrlError):
     """The cache of decoded steps cannot be used, or the text of its size limit is not valid."""
 

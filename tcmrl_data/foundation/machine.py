@@ -1,4 +1,4 @@
-"""The machine and the process: processor, cores and memory; how threads wait, and when signals are obeyed.
+"""The machine and the process: processor, cores, memory and cache; how threads wait, when signals are obeyed.
 
 The cores are counted here and not by `joblib.cpu_count`, which reads the quota of the outermost control group
 alone: a job of Slurm or systemd in a group of its own would start as many workers as the machine has cores.
@@ -120,6 +120,26 @@ def parse_bytes(text: str) -> int:
             "such as 500M or 2G"
         )
     return num_bytes
+
+
+CACHE_BYTES = 100 * 10**9
+"""Default of TCMRL_CACHE_LIMIT, the maximum size of decoded steps, and of fetched parts, in the cache."""
+
+
+def cache_folder() -> Path:
+    """TCMRL_CACHE, or `tcmrl` in the user's cache folder (XDG_CACHE_HOME or ~/.cache)."""
+    own = os.environ.get("TCMRL_CACHE")
+    return Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tcmrl"
+
+
+def cache_limit() -> int:
+    """The maximum size of all entries in bytes: TCMRL_CACHE_LIMIT (such as `20G`), or 100 GB.
+
+    Raises:
+        CacheError: the variable is not a valid size.
+    """
+    text = os.environ.get("TCMRL_CACHE_LIMIT")
+    return parse_bytes(text) if text else CACHE_BYTES
 
 
 SPINS = "1000"

@@ -100,7 +100,7 @@ def apply_operation(
         "run": template.name,
     }
     jobs = tuple(jobs_of_pairs(names, keys))
-    spec = DeriveSpec(dataset.path, Path(out), operation, common, recipe, source.seed, jobs)
+    spec = DeriveSpec(dataset.path_on_disk, Path(out), operation, common, recipe, source.seed, jobs)
     make_of_parts(
         dataset,
         Path(out),

@@ -210,11 +210,12 @@ def write_view(
         raise StoreError(f"--view {file}: a view is a file whose name ends in .json, and is not {MANIFEST}")
     if os.path.lexists(file):
         raise StoreError(f"--view {file} exists; choose another name or remove it")
+    folder = source.path_on_disk if source.remote else source.folder
     chosen = set(keys)
     table = source.parts.only(chosen)
     fields = {
         "schema_version": VIEW_SCHEMA,
-        "source": os.path.relpath(source.folder.resolve(), file.parent.resolve()),
+        "source": os.path.relpath(folder.resolve(), file.parent.resolve()),
         "source_root": source.sealed_root,
         "label": label,
         "derivation": derivation.model_dump(mode="json"),

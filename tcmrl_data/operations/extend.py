@@ -120,11 +120,11 @@ def extend_dataset(
     template = Run(name=run, kind="extended", seed=seed, recipe=recipe, origin=origin, steps=None)
     runs = _with_runs(dataset, template, names)
     new = tuple(job for job in jobs if job.key not in dataset.parts)
-    target = dataset.path if out is None else out
+    target = dataset.path_on_disk if out is None else out
     counts = (tuple(sorted(set(names.values()))), len(new), len(jobs) - len(new), episodes)
     if dry_run or (out is None and not new):
         return ExtendReport(target, *counts, None if dry_run else dataset.manifest.root)
-    spec = DeriveSpec(dataset.path, target, EXTEND, common, recipe, seed, new)
+    spec = DeriveSpec(dataset.path_on_disk, target, EXTEND, common, recipe, seed, new)
     if out is None:
         manifest = add_parts(dataset, spec, runs=runs, workers=workers, progress=progress)
     else:

@@ -124,7 +124,7 @@ def relabel_dataset(
     derivation = derivation_of(RELABEL, recorded, [dataset])
     check_out(out, derivation)
     common = {"first_episode": first_episode_of(source)}
-    spec = DeriveSpec(dataset.path, out, RELABEL, common, recipe, seed, jobs)
+    spec = DeriveSpec(dataset.path_on_disk, out, RELABEL, common, recipe, seed, jobs)
     _try_out(dataset, spec)
     steps = sum(dataset.entry(job.source).steps for job in jobs)
     counts = (tuple(found.name for found in runs), len(pairs), len(jobs), steps)

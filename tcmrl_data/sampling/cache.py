@@ -42,7 +42,7 @@ from tcmrl_data.foundation.disk import (
 )
 from tcmrl_data.foundation.errors import CacheError, LockedError, StorageError
 from tcmrl_data.foundation.locks import is_locked, take_shared_lock, try_exclusive_lock
-from tcmrl_data.foundation.machine import available_cores, parse_bytes, size
+from tcmrl_data.foundation.machine import available_cores, cache_folder, cache_limit, size
 from tcmrl_data.foundation.plain_files import one_line, printable
 from tcmrl_data.foundation.records import Record, record_bytes
 from tcmrl_data.sampling.rows import (
@@ -58,9 +58,6 @@ from tcmrl_data.sampling.rows import (
 
 if TYPE_CHECKING:
     from tcmrl_data.dataset.selection import Selection
-
-CACHE_BYTES = 100 * 10**9
-"""Default of TCMRL_CACHE_LIMIT, the maximum size of all entries."""
 
 CHECKED_BYTES = 10**9
 """A file up to this size is hashed whenever it is opened, which takes about a second on one core."""
@@ -109,22 +106,6 @@ class EntryRecord(Record):
     tasks: int
     parts: int
     digest: str
-
-
-def cache_folder() -> Path:
-    """TCMRL_CACHE, or `tcmrl` in the user's cache folder (XDG_CACHE_HOME or ~/.cache)."""
-    own = os.environ.get("TCMRL_CACHE")
-    return Path(own) if own else Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "tcmrl"
-
-
-def cache_limit() -> int:
-    """The maximum size of all entries in bytes: TCMRL_CACHE_LIMIT (such as `20G`), or 100 GB.
-
-    Raises:
-        CacheError: the variable is not a valid size.
-    """
-    text = os.environ.get("TCMRL_CACHE_LIMIT")
-    return parse_bytes(text) if text else CACHE_BYTES
 
 
 def cached_rows(

@@ -168,6 +168,8 @@ def fill_table(table: Table, plan: Sequence[PartRows], *, check_digests: bool = 
         StoreError: arrays cannot be decoded, do not form episodes, or are not those of the part's record;
             the message names the part.
     """
+    for part in plan[:1]:
+        part.dataset.fetch(part.key for part in plan)
     with ThreadPoolExecutor(min(READERS, available_cores())) as pool:
         lengths = pool.map(
             lambda part: read_part(part, table[part.first : part.last], check_digests=check_digests), plan

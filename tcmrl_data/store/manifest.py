@@ -5,6 +5,7 @@ dataset exists when its manifest does.
 """
 
 import contextlib
+import os
 from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -242,8 +243,14 @@ class Manifest(Record):
         return self
 
 
-def dataset_folder(path: str | Path) -> Path:
-    """The folder of a dataset, given the folder or its `manifest.json`."""
+def dataset_folder(path: str | os.PathLike[str]) -> Path:
+    """The folder of a dataset, given the folder or its `manifest.json`.
+
+    Raises:
+        ManifestError: it is an address, whose files are not on this disk.
+    """
+    if "://" in os.fspath(path):
+        raise ManifestError(f"{path} is not on this disk; fetch it with `tcmrl-data pull {path} FOLDER`")
     path = Path(path)
     return path.parent if path.name == MANIFEST else path
 
