@@ -1,6 +1,7 @@
 """`tcmrl report` and `runs`: what finished runs say, and which runs there are."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -130,13 +131,26 @@ def _default_out(folder: Path) -> Path:
 
 @click.command()
 @click.argument("folder", type=PATH, required=False)
+@click.option(
+    "--metric",
+    "metrics",
+    metavar="NAME",
+    multiple=True,
+    default=["watch/return"],
+    show_default=True,
+    help="Column of the last value of a training metric, such as loss/critic; repeatable.",
+)
 @output_options
-def runs(folder: Path | None, as_json: bool) -> None:
-    """List the runs in FOLDER (default: runs) and its subfolders.
+def runs(folder: Path | None, metrics: tuple[str, ...], as_json: bool) -> None:
+    """Compare the runs in FOLDER (default: runs) and its subfolders.
+
+    `watch/return` is that of `tcmrl train --watch`; the last return is that of the last `tcmrl evaluate`.
+    --json has all metrics.
 
     \b
     Examples:
       tcmrl runs
+      tcmrl runs --metric watch/return --metric loss/critic
       tcmrl runs results/perspectives --json
     """
     from tcmrl_algo.training.checkpoint import list_runs
@@ -153,23 +167,24 @@ def runs(folder: Path | None, as_json: bool) -> None:
         return
     table = make_table(
         f"Runs in {folder}",
-        columns=["run", "trained", "steps", "dataset", "last return"],
+        columns=["run", "trained", "steps", "dataset", *metrics, "last return"],
         text=["run", "dataset"],  # a run's name is never folded: it is copied
         long_text=["trained"],
     )
     for row in rows:
-        table.add_row(*_cells(row))
+        table.add_row(*_cells(row, metrics))
     print_table(table)
 
 
-def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+def _cells(row: dict[str, Any], metrics: Sequence[str]) -> tuple[str, ...]:
     if "error" in row:
-        return row["path"], f"unreadable: {row['error']}", "", "", ""
+        return row["path"], f"unreadable: {row['error']}"
     evaluation = row["evaluation"]
     return (
         row["path"],
         f"{row['algorithm']} on {row['environment']}, seed {row['seed']}",
         f"{row['step']:,}/{row['steps']:,}",
         row["root"][:12],
+        *(f"{row['metrics'][name]:.4g}" if name in row["metrics"] else "–" for name in metrics),
         f"{evaluation['protocol']} {number(evaluation['final'])}" if evaluation else "–",
     )

@@ -3,7 +3,7 @@
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -15,8 +15,10 @@ from .frame import (
     duration,
     main_program,
     next_commands,
+    number,
     output_options,
     print_json,
+    remark,
     stopped_by_signals,
     typed_command,
 )
@@ -88,6 +90,12 @@ def tcmrl() -> None:
     show_default="half of the available memory",
     help="Size such as 2G; larger data are read through the cache.",
 )
+@click.option(
+    "--watch",
+    type=COUNT,
+    metavar="STEPS",
+    help="Every so many steps, also print and log the return of four training tasks after adaptation.",
+)
 @TRAINING_SETTINGS
 @click.option("--resume", is_flag=True, help="Continue from the newest checkpoint in --out.")
 @click.option("--seed", type=INDEX, show_default="0", help="Seed of all random numbers.")
@@ -102,6 +110,7 @@ def train(
     stop_at: int | None,
     device: str | None,
     memory_limit: str | None,
+    watch: int | None,
     overrides: tuple[str, ...],
     resume: bool,
     seed: int | None,
@@ -115,13 +124,18 @@ def train(
     run; SIGUSR1 saves one, and the run continues. --resume continues a run that was stopped or killed; the
     result is that of an uninterrupted run.
 
+    --watch adapts a copy of the policy to stored trajectories of four of the training tasks. It says how
+    training goes, not how well the policy generalizes, and changes no result. What it took is printed at the
+    end.
+
     \b
     Examples:
       tcmrl train data/point-robot --seed 1
-      tcmrl train data/point-robot --algo no_context
+      tcmrl train data/point-robot --algo no_context --watch 500
       tcmrl train data/half-cheetah-vel --set batch.window_length=8
       tcmrl train data/point-robot --seed 1 --resume
     """
+    from tcmrl_algo import TrainingWatch, resolve_for, resume_run, train_run
     from tcmrl_data import open_dataset, parse_bytes
 
     limit = parse_bytes(memory_limit) if memory_limit else None
@@ -133,73 +147,38 @@ def train(
             f"{shlex.quote(str(dataset))}`"
         )
     opened = open_dataset(dataset)
-    config = _config(opened, algo=algo, profile=profile, overrides=overrides)
+    config = resolve_for(
+        opened, profile=profile or opened.manifest.profile, algorithm=algo, overrides=overrides
+    )
     folder = out or Path("runs") / f"{opened.name}-{config.settings.run.algorithm}-seed{seed or 0}"
+    watching = TrainingWatch(opened, every=watch) if watch else None
     with stopped_by_signals(lambda: _how_to_continue(folder)), StageProgress() as progress:
+        if watching is not None:
+            progress.note(watching.described())
+        shared: dict[str, Any] = {
+            "steps": stop_at,
+            "memory_limit": limit,
+            "watch": watching,
+            "report": lambda event: _show(progress, event),
+            "say": progress.note,
+        }
         if resume:
-            report = _resume(
-                folder,
-                opened,
-                algo=algo,
-                profile=profile,
-                overrides=overrides,
-                seed=seed,
-                steps=stop_at,
-                device=device,
-                memory_limit=limit,
-                progress=progress,
-            )
+            _check_given(folder, algo=algo, profile=profile, seed=seed, overrides=overrides)
+            report = resume_run(folder, opened, device=device, **shared)
         else:
-            report = _train(
-                folder,
+            _note_source(opened, config, profile or opened.manifest.profile, progress)
+            report = train_run(
                 opened,
+                folder,
                 config=config,
                 profile=profile or opened.manifest.profile,
                 seed=seed or 0,
-                steps=stop_at,
                 device=device or "cpu",
-                memory_limit=limit,
-                progress=progress,
+                **shared,
             )
     _print_training(report, as_json=as_json)
-
-
-def _config(
-    dataset: "Dataset", *, algo: str | None, profile: Profile | None, overrides: Sequence[str]
-) -> "TrainingConfig":
-    from tcmrl_algo import resolve_for
-
-    chosen = profile or dataset.manifest.profile
-    return resolve_for(dataset, profile=chosen, algorithm=algo, overrides=overrides)
-
-
-def _train(
-    folder: Path,
-    dataset: "Dataset",
-    *,
-    config: "TrainingConfig",
-    profile: Profile,
-    seed: int,
-    steps: int | None,
-    device: str,
-    memory_limit: int | None,
-    progress: StageProgress,
-) -> "TrainingReport":
-    from tcmrl_algo import train_run
-
-    _note_source(dataset, config, profile, progress)
-    return train_run(
-        dataset,
-        folder,
-        config=config,
-        profile=profile,
-        seed=seed,
-        steps=steps,
-        device=device,
-        memory_limit=memory_limit,
-        report=lambda event: _show(progress, event),
-        say=progress.note,
-    )
+    if watching is not None:
+        remark(f"watching took {duration(watching.seconds)} of {duration(report.seconds)}")
 
 
 def _note_source(
@@ -216,20 +195,11 @@ def _note_source(
     progress.note(f"{dataset.folder} holds no {table} table; its values are {source}")
 
 
-def _resume(
-    folder: Path,
-    dataset: "Dataset",
-    *,
-    algo: str | None,
-    profile: Profile | None,
-    overrides: Sequence[str],
-    seed: int | None,
-    steps: int | None,
-    device: str | None,
-    memory_limit: int | None,
-    progress: StageProgress,
-) -> "TrainingReport":
-    from tcmrl_algo import open_run, resume_run
+def _check_given(
+    folder: Path, *, algo: str | None, profile: Profile | None, seed: int | None, overrides: Sequence[str]
+) -> None:
+    """Refuses options that differ from what a run was begun with."""
+    from tcmrl_algo import open_run
 
     record = open_run(folder).record
     for name, given, recorded in (
@@ -240,15 +210,6 @@ def _resume(
         if given is not None and given != recorded:
             raise click.UsageError(f"{folder} is a run with {name} {recorded}, not {given}; omit {name}.")
     _check_settings(folder, record.config, overrides)
-    return resume_run(
-        folder,
-        dataset,
-        steps=steps,
-        device=device,
-        memory_limit=memory_limit,
-        report=lambda event: _show(progress, event),
-        say=progress.note,
-    )
 
 
 def _check_settings(folder: Path, config: "TrainingConfig", overrides: Sequence[str]) -> None:
@@ -276,7 +237,8 @@ def _how_to_continue(folder: Path) -> str:
 
 def _show(progress: StageProgress, event: "TrainingProgress") -> None:
     losses = [f"{name} {value:.3g}" for name, value in event.metrics.items() if name.startswith("loss/")]
-    detail = ", ".join([*losses[:1], f"{event.data_share:.0%} waiting for data"])
+    watched = [] if event.watched is None else [f"return {number(event.watched)}"]
+    detail = ", ".join([*losses[:1], *watched, f"{event.data_share:.0%} waiting for data"])
     progress.update("training", done=event.step, total=event.steps, unit="steps", detail=detail)
 
 

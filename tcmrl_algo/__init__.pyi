@@ -27,6 +27,7 @@ from .evaluation.evaluate import evaluate_run as evaluate_run
 from .evaluation.protocols.base import PROTOCOLS as PROTOCOLS
 from .evaluation.protocols.base import Adaptation as Adaptation
 from .evaluation.protocols.base import Protocol as Protocol
+from .evaluation.watch import TrainingWatch as TrainingWatch
 from .experiment.datasets import MissingDataset as MissingDataset
 from .experiment.datasets import build_missing as build_missing
 from .experiment.datasets import missing_datasets as missing_datasets

@@ -1,7 +1,8 @@
 """Training: determinism, resuming, checkpoints, metrics, and `tcmrl train`."""
 
 import json
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ import tcmrl_algo
 from tcmrl_algo import open_run, resume_run, train_run
 from tcmrl_algo.algorithms.core.context import ContextAlgorithm
 from tcmrl_algo.algorithms.core.method import METHODS
+from tcmrl_algo.evaluation.arena import Arena
+from tcmrl_algo.training.checkpoint import list_runs
 from tcmrl_algo.training.train import TrainingProgress
-from tcmrl_data import CheckpointError, Dataset, SelectionError, TrainingError
+from tcmrl_data import CheckpointError, Dataset, SelectionError, Task, TrainingError
 from tests.commands import Call, assert_refused, in_process
 from tests.datasets import with_tasks
 from tests.small_training import SMALL, config_of
@@ -233,8 +236,53 @@ def test_contexts_may_come_from_other_snapshots_than_transitions(start: Train, t
 def test_progress_is_reported_with_rates(start: Train) -> None:
     seen: list[TrainingProgress] = []
     start("run", steps=25, report=seen.append)
-    assert [(progress.step, progress.steps) for progress in seen] == [(10, 25), (20, 25), (25, 25)]
+    assert {(progress.step, progress.steps) for progress in seen} >= {(10, 25), (20, 25), (25, 25)}
     assert all(progress.rate > 0 and 0 <= progress.data_share <= 1 for progress in seen)
+
+
+def test_a_slow_step_is_reported_before_it_is_logged(start: Train, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tcmrl_algo.training.train.SHOWN_SECONDS", 0.0)
+    seen: list[TrainingProgress] = []
+    folder = start("run", steps=25, report=seen.append).run.folder
+    assert [progress.step for progress in seen] == list(range(1, 26))
+    assert all(progress.rate > 0 and "loss/critic" in progress.metrics for progress in seen)
+    assert [line["step"] for line in _metrics(folder)] == [10, 20, 25]
+
+
+@pytest.mark.parametrize("algorithm", ["tcmrl", "macaw", "task_known"])
+def test_a_watched_run_has_the_tensors_of_an_unwatched_one(
+    start: Train, tiny: Dataset, tmp_path: Path, algorithm: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    straight = start("straight", algorithm=algorithm, steps=20)
+    played: list[int] = []
+    adapted = Arena.adapted
+
+    def play(arena: Arena, tasks: Sequence[Task], contexts: Sequence[Any], **more: Any) -> Any:
+        played.extend(task.index for task in tasks)
+        return adapted(arena, tasks, contexts, **more)
+
+    monkeypatch.setattr(Arena, "adapted", play)
+    seen: list[TrainingProgress] = []
+    watch = tcmrl_algo.TrainingWatch(tiny, every=8)
+    watched = start("watched", algorithm=algorithm, steps=20, watch=watch, report=seen.append)
+    assert watched.digest == straight.digest
+    assert set(played) <= {task.index for task in tiny.train_tasks}
+    lines = {line["step"]: line for line in _metrics(watched.run.folder)}
+    returns = {step: line["watch/return"] for step, line in lines.items() if "watch/return" in line}
+    assert sorted(returns) == [8, 16] and sorted(lines) == [8, 10, 16, 20]
+    assert seen[-1].watched == returns[16]
+    assert watch.seconds > 0
+    (row,) = (row for row in list_runs(tmp_path) if row["path"] == str(watched.run.folder))
+    assert row["metrics"]["watch/return"] == returns[16]
+
+
+def test_watching_says_which_tasks_and_what_it_took(tiny_folder: Path, tmp_path: Path, call: Call) -> None:
+    sets = [word for value in (*SMALL, "run.steps=10") for word in ("--set", value)]
+    code, _, errors = call("train", tiny_folder, "--watch", 5, "--out", tmp_path / "run", *sets)
+    assert code == 0
+    assert re.search(r"watching training tasks [0-9, ]+ every 5 steps: uniform actions -[0-9.]+", errors)
+    assert re.search(r"watching took .* of ", errors)
+    assert re.search(r"-[0-9]+", call("runs", tmp_path)[1])
 
 
 def test_the_memory_limit_changes_where_data_are_and_no_result(
@@ -312,6 +360,8 @@ def test_the_list_of_runs_says_how_far_they_are(start: Train, tmp_path: Path, ca
     output = call("runs", tmp_path)[1]
     assert "tcmrl on point-robot, seed 3" in output and "10/10" in output and "idaq -2.50" in output
     assert first["root"][:12] in output
+    loss = f"{first['metrics']['loss/critic']:.4g}"
+    assert loss in call("runs", tmp_path, "--metric", "loss/critic")[1] and loss not in output
     assert_refused(call("runs", tmp_path / "nothing"), "nothing", "is not a folder")
 
 

@@ -19,8 +19,9 @@ from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import make_folders, publish_folder, remove_abandoned, remove_tree
 from tcmrl_data.foundation.records import Frozen, read_record, record_bytes, write_record
 
+METRICS = "metrics.jsonl"
 EVALUATIONS = "evaluations.jsonl"
-"""In the folder of a run: a line of means for every evaluation."""
+"""In the folder of a run: a line for every logged step, and one of means for every evaluation."""
 
 KEPT = 2
 """Newest checkpoints kept: the last one, and one to fall back on."""
@@ -210,7 +211,8 @@ def list_runs(root: str | Path) -> list[dict[str, Any]]:
 
     Returns:
         Rows of `path`, `algorithm`, `environment`, `seed`, `step` of the newest checkpoint (0 without one),
-        `steps`, `dataset`, `root` of the dataset, and `evaluation`, the last one or None.
+        `steps`, `dataset`, `root` of the dataset, `metrics`, the last value of each, and `evaluation`, the
+        last one or None.
     """
     rows: list[dict[str, Any]] = []
     for file in sorted(Path(root).glob("**/run.json")):
@@ -223,6 +225,10 @@ def list_runs(root: str | Path) -> list[dict[str, Any]]:
 
 def _row(run: Run) -> dict[str, Any]:
     record, checkpoints = run.record, run.checkpoints()
+    metrics: dict[str, Any] = {}
+    for line in _written(run.folder / METRICS):
+        metrics |= line  # a watched return is in some lines alone
+    metrics = {name: value for name, value in metrics.items() if name not in ("step", "stage")}
     return {
         "path": str(run.folder),
         "algorithm": record.config.settings.run.algorithm,
@@ -232,13 +238,12 @@ def _row(run: Run) -> dict[str, Any]:
         "steps": record.steps,
         "dataset": record.dataset,
         "root": record.root,
-        "evaluation": _last_evaluation(run.folder / EVALUATIONS),
+        "metrics": metrics,
+        "evaluation": next(reversed(_written(run.folder / EVALUATIONS)), None),
     }
 
 
-def _last_evaluation(file: Path) -> dict[str, Any] | None:
-    """The last whole line of a run's evaluations."""
+def _written(file: Path) -> list[dict[str, Any]]:
+    """The whole lines of a file of JSON lines that a run appends to; none where it is missing."""
     lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
-    whole = [line for line in lines if line.endswith("}")]
-    found: dict[str, Any] | None = json.loads(whole[-1]) if whole else None
-    return found
+    return [json.loads(line) for line in lines if line.endswith("}")]

@@ -11,7 +11,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
-from typing import final
+from typing import Protocol, final, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -21,7 +21,15 @@ from tcmrl_algo.algorithms.core.method import Algorithm
 from tcmrl_algo.algorithms.core.problem import MomentsRecord, TaskParameters, problem_of
 from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_algo.training.batches import StagedBatches, open_batches
-from tcmrl_algo.training.checkpoint import EVALUATIONS, Run, RunRecord, open_run, tensors_digest, write_run
+from tcmrl_algo.training.checkpoint import (
+    EVALUATIONS,
+    METRICS,
+    Run,
+    RunRecord,
+    open_run,
+    tensors_digest,
+    write_run,
+)
 from tcmrl_algo.training.config import method_of, stage_plan
 from tcmrl_data import CheckpointError, Dataset, Prefetch, TcmrlError, TrainingError
 from tcmrl_data.foundation.errors import DivergenceError
@@ -73,7 +81,7 @@ class MetricsWriter:
     """
 
     def __init__(self, folder: Path, *, step: int) -> None:
-        self._file = folder / "metrics.jsonl"
+        self._file = folder / METRICS
         self._keep_until(step)
         self._stream = self._file.open("a", encoding="utf-8")
         self._board = SummaryWriter(str(folder / "tensorboard"), purge_step=step + 1)
@@ -110,8 +118,22 @@ REMEDY = (
 )
 """Against divergence."""
 
+SHOWN_SECONDS = 1.0
+"""Longest time between two reports; only logged steps are written down."""
+
 PREFETCHED = 2
 """Batches that wait ready; results do not depend on it."""
+
+
+@runtime_checkable
+class Watch(Protocol):
+    """Looks at a run every so many steps, and changes nothing of it."""
+
+    every: int
+
+    def __call__(self, record: RunRecord, tensors: Mapping[str, Tensor]) -> Mapping[str, float]:
+        """Metrics of the run at this step, `watch/return` among them."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -125,6 +147,7 @@ class TrainingProgress:
         rate: steps per second since the last report.
         data_share: share of that time spent waiting for batches.
         metrics: of that step.
+        watched: the last `watch/return`, if a watch looks at the run.
     """
 
     step: int
@@ -133,6 +156,7 @@ class TrainingProgress:
     rate: float
     data_share: float
     metrics: Mapping[str, float]
+    watched: float | None = None
 
 
 @dataclass(frozen=True)
@@ -170,6 +194,7 @@ def train_run(
     steps: int | None = None,
     device: str = "cpu",
     memory_limit: int | None = None,
+    watch: Watch | None = None,
     report: Callable[[TrainingProgress], None] = ignore,
     say: Callable[[str], None] = keep_quiet,
 ) -> TrainingReport:
@@ -181,7 +206,8 @@ def train_run(
         profile: whose table it was; recorded.
         steps: where to stop, instead of `run.steps`; schedules keep the length that `run.steps` gives them.
         memory_limit: bytes of data beyond which the cache is used; half of the available memory if None.
-        report: called after every logged step.
+        watch: looks at the run now and then; its metrics are logged. No tensor of the run depends on it.
+        report: called after every logged step, and about once a second.
         say: told where data are read from, where that is not memory.
 
     Raises:
@@ -224,7 +250,7 @@ def train_run(
     algorithm = create_algorithm(record, dataset)
     run = write_run(Path(out), record)  # only now: what cannot start leaves nothing behind
     try:
-        return _train(run, algorithm, batches, start=0, report=report)
+        return _train(run, algorithm, batches, start=0, watch=watch, report=report)
     except TcmrlError:
         raise  # such as a diverged loss, whose metrics say how
     except Exception:  # of a method's code: there is nothing to go on with, and the next try is not blocked
@@ -240,6 +266,7 @@ def resume_run(
     steps: int | None = None,
     device: str | None = None,
     memory_limit: int | None = None,
+    watch: Watch | None = None,
     report: Callable[[TrainingProgress], None] = ignore,
     say: Callable[[str], None] = keep_quiet,
 ) -> TrainingReport:
@@ -277,7 +304,8 @@ def resume_run(
     say(f"going on from step {start:,}" if start else "no checkpoint was saved: starting at step 0")
     if start:
         algorithm.load_tensors(run.newest().tensors())
-    return _train(write_run(run.folder, record), algorithm, batches, start=start, report=report)
+    run = write_run(run.folder, record)
+    return _train(run, algorithm, batches, start=start, watch=watch, report=report)
 
 
 def create_algorithm(record: RunRecord, dataset: Dataset) -> Algorithm:
@@ -320,6 +348,7 @@ def _train(
     batches: StagedBatches,
     *,
     start: int,
+    watch: Watch | None,
     report: Callable[[TrainingProgress], None],
 ) -> TrainingReport:
     """The loop: batch n - 1 makes step n; signals take effect after a checkpoint of their step."""
@@ -327,7 +356,8 @@ def _train(
     stages, window_length = stage_plan(run.record.config), run.record.config.settings.batch.window_length
     keep_freed_memory()
     began = time.perf_counter()
-    logged_at, logged_step, logged_wait = began, start, 0.0
+    logged_at, logged_step, logged_wait, shown_at = began, start, 0.0, began
+    watched: float | None = None
     with (
         DeferredInterrupts() as interrupts,
         MetricsWriter(run.folder, step=start) as writer,
@@ -336,17 +366,23 @@ def _train(
         for step in range(start + 1, last + 1):
             metrics = algorithm.update(next(stream), step)
             _check_sizes(metrics, algorithm.limits(), step)
-            if step % settings.log_every == 0 or step == last:
+            now = time.perf_counter()
+            is_watched = watch is not None and step % watch.every == 0
+            is_logged = step % settings.log_every == 0 or step == last or is_watched
+            if is_logged or now - shown_at > SHOWN_SECONDS:
                 values = {name: float(value) for name, value in metrics.items()}
-                now = time.perf_counter()
                 seconds = max(now - logged_at, 1e-9)
                 rate, share = (step - logged_step) / seconds, (stream.waited - logged_wait) / seconds
-                logged_at, logged_step, logged_wait = now, step, stream.waited
-                about = {"data/short_trajectories": float(batches.short_trajectories(window_length))}
-                times = {"time/steps_per_second": rate, "time/data_share": share}
                 stage = stages.at(step).stage
-                writer.write(step, values | about | times, stage=stage)
-                report(TrainingProgress(step, last, stage, rate, share, values))
+                if is_logged:
+                    about = {"data/short_trajectories": float(batches.short_trajectories(window_length))}
+                    times = {"time/steps_per_second": rate, "time/data_share": share}
+                    seen = watch(run.record, algorithm.tensors()) if watch and is_watched else {}
+                    watched = seen.get("watch/return", watched)
+                    writer.write(step, values | about | times | dict(seen), stage=stage)
+                    logged_at, logged_step, logged_wait = time.perf_counter(), step, stream.waited
+                report(TrainingProgress(step, last, stage, rate, share, values, watched))
+                shown_at = time.perf_counter()
             stopping = interrupts.received
             if step % settings.checkpoint_every == 0 or step == last or interrupts.checkpoint_wanted:
                 _check_finite(algorithm.tensors(), step)
