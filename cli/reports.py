@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from .frame import make_table, number, output_options, print_json, print_table, remark
-from .options import FILE, PATH
+from .options import PATH
 from .places import RUN_PATH
 from .progress import StageProgress
 
@@ -24,7 +24,7 @@ from .progress import StageProgress
 )
 @click.option(
     "--rows",
-    type=FILE,
+    type=PATH,
     metavar="FILE",
     help="Also add the runs to this table of results, such as results/runs.csv.",
 )
