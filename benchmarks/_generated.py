@@ -9,10 +9,9 @@ from tcmrl_data.behavior.base import GaussianDescription, Snapshot
 from tcmrl_data.building.ledger import Ledger
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.envs.base import Environment, Task
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import sha256
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.disk import STAGING, make_folders, replace_file
-from tcmrl_data.foundation.records import sealed
+from tcmrl_data.foundation.records import sealed, sha256
 from tcmrl_data.parts.making import Published, make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.recipe import choose_tasks

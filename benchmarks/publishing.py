@@ -16,9 +16,9 @@ from typing import Any
 import torch
 
 import tcmrl_data
-from tcmrl_data.building.unit import UnitSpec, run_unit
-from tcmrl_data.foundation import canonical
+from tcmrl_data.building.plan import UnitSpec, run_unit
 from tcmrl_data.foundation import disk as publish
+from tcmrl_data.foundation import records
 from tcmrl_data.foundation.disk import Disk, make_folders
 from tcmrl_data.recipe.recipe import choose_tasks
 
@@ -50,7 +50,7 @@ def main() -> None:
     disk = Disk()
     disk.sync = syncs(disk.sync)  # type: ignore[method-assign]
     publish.disk = disk
-    canonical.hashlib = SimpleNamespace(sha256=hashes(hashlib.sha256))  # type: ignore[assignment]
+    records.hashlib = SimpleNamespace(sha256=hashes(hashlib.sha256))  # type: ignore[assignment]
     with tempfile.TemporaryDirectory(dir=".") as folder:
         dataset = Path(folder).resolve() / "data"
         make_folders(dataset)

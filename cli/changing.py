@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 import click
 
 from tcmrl_data.foundation.errors import TierError
+from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
-from tcmrl_data.foundation.plain_files import printable
 
 from .frame import fail_incomplete, output_options, print_json, remark
 from .options import (

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
-from tcmrl_data.foundation.plain_files import printable
 
 from .changing import derive, extend, merge, relabel
 from .frame import (

@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 import click
 
 from tcmrl_data.foundation.errors import TcmrlError
+from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import ENDING, leave_out_compiler, open_closed_streams, sleep_soon
-from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.foundation.plugins import missing_package
 
 from .groups import GONE, gone

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
-from tcmrl_data.foundation.plain_files import printable
 
 from .frame import duration, fail_incomplete, make_table, output_options, print_json, print_table, remark
 from .groups import Commands

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
-from tcmrl_data.foundation.plain_files import printable
 
 from .frame import INCOMPLETE, number, output_options, print_json, remark, stopped_by_signals
 from .options import DATASET, FILE, INDEX

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from tcmrl_data.foundation.errors import TcmrlError
+from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import available_cores, size
-from tcmrl_data.foundation.plain_files import printable
 from tcmrl_data.recipe import PROFILES, Profile
 
 from .frame import (

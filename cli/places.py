@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import click
 from click.shell_completion import CompletionItem
 
-from tcmrl_data.foundation.canonical import leaves
 from tcmrl_data.foundation.plugins import declared_names
 
 if TYPE_CHECKING:
@@ -129,8 +128,13 @@ def _starting(names: Iterable[str], incomplete: str) -> list[CompletionItem]:
     return [CompletionItem(name) for name in sorted(set(names)) if name.startswith(incomplete)]
 
 
-def _keys(tables: Mapping[str, Any]) -> list[str]:
-    return [".".join(path) for path, value in leaves(tables) if value != {}]
+def _keys(tables: Mapping[str, Any], table: str = "") -> Iterator[str]:
+    """The dotted names of all values; `leaves` would do, but its module loads pydantic, which is slow."""
+    for name, value in tables.items():
+        if isinstance(value, Mapping):
+            yield from _keys(value, f"{table}{name}.")
+        else:
+            yield f"{table}{name}"
 
 
 def _shipped(folder: str = "") -> Iterator[str]:

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
-from tcmrl_data.foundation.plain_files import printable
 
 from .frame import QUIET_OPTION, output_options, print_json, remark
 from .options import DATASET, DRY_RUN, FILE, FORMAT_NAME, PATH, SNAPSHOTS, SPLIT, TASKS, TIER, indices

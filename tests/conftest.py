@@ -17,6 +17,7 @@ from hypothesis import HealthCheck, settings
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe
 from tcmrl_data.engine.local import InProcessEngine, LocalEngine
+from tests import commands
 from tests.namespace import has_only_loopback
 from tests.workers import MARK, ROOT
 
@@ -96,6 +97,14 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("TCMRL_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> commands.Call:
+    """Runs `tcmrl-data` in this process."""
+    from tcmrl_cli.data import data
+
+    return commands.in_process(data, capsys)
 
 
 @pytest.fixture

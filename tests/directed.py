@@ -22,7 +22,7 @@ from tests.workers import wait_for
 BUILD, EXPERIMENT = "tcmrl_data.building.build", "tcmrl_algo.experiment.run"
 """The modules that make units."""
 
-WORKERS = {BUILD: "tcmrl_data.building.unit", EXPERIMENT: "tcmrl_algo.experiment.job"}
+WORKERS = {BUILD: "tcmrl_data.building.plan", EXPERIMENT: "tcmrl_algo.experiment.job"}
 """Module that does the work of a unit, by the module that makes the unit."""
 
 Report = Callable[[Mapping[str, Any]], None]

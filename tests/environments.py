@@ -9,8 +9,7 @@ import numpy as np
 
 from tcmrl_data import load_recipe
 from tcmrl_data.envs.base import Environment, Parameters, draw_tasks
-from tcmrl_data.envs.controller import Controller, Trajectory
-from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.rollout import Controller, Trajectory, roll_out
 
 ML1_IN_FULL = ("ml1/reach", "ml1/door-close", "ml1/stick-pull")
 MOST_MEMBERS = 3

@@ -8,9 +8,8 @@ import pytest
 
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe
-from tcmrl_data.foundation.canonical import parse_json
 from tcmrl_data.foundation.errors import RecipeError
-from tcmrl_data.foundation.records import sealed
+from tcmrl_data.foundation.records import parse_json, sealed
 from tcmrl_data.recipe.document import (
     About,
     Reference,

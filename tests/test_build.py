@@ -1,6 +1,5 @@
 import errno
 import json
-import os
 import shutil
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
@@ -23,15 +22,14 @@ from tcmrl_data import (
 )
 from tcmrl_data.building.build import Driver
 from tcmrl_data.building.ledger import Ledger
-from tcmrl_data.building.plan import plan_build
-from tcmrl_data.building.unit import UnitSpec, run_unit
+from tcmrl_data.building.plan import UnitSpec, plan_build, run_unit
 from tcmrl_data.building.work_files import BuildEvent, StatusFile
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
 from tcmrl_data.envs.base import LaneStep
-from tcmrl_data.envs.controller import BoolArray, FloatArray
 from tcmrl_data.envs.point_robot import PointRobotLanes
-from tcmrl_data.foundation.disk import LOCK, lock_file
-from tcmrl_data.foundation.errors import BuildError, LockedError, ManifestError, StoreError
+from tcmrl_data.envs.rollout import BoolArray, FloatArray
+from tcmrl_data.foundation.disk import LOCK
+from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
 from tcmrl_data.recipe.recipe import choose_tasks
 from tcmrl_data.store import archive as archive_module
 from tcmrl_data.store.archive import Archive, pack_archive
@@ -168,19 +166,6 @@ def test_another_recipe_or_seed_is_refused(tiny_copy: Copy, tiny_recipe: Recipe)
         tcmrl_data.build_dataset(other, folder, tasks=TASKS)
     with pytest.raises(BuildError, match="seed 0, not 4"):
         tcmrl_data.build_dataset(tiny_recipe, folder, seed=4)
-
-
-def test_a_folder_that_is_no_dataset_is_refused(tmp_path: Path, tiny_recipe: Recipe) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(BuildError, match="no dataset"):
-        tcmrl_data.build_dataset(tiny_recipe, tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
-
-
-def test_two_builders_at_once_one_is_refused_by_name(tiny_copy: Copy, tiny_recipe: Recipe) -> None:
-    folder = tiny_copy()
-    with lock_file(folder / LOCK, "the dataset"), pytest.raises(LockedError, match=f"process {os.getpid()}"):
-        tcmrl_data.build_dataset(tiny_recipe, folder, tasks=TASKS)
 
 
 def test_a_part_that_a_later_version_made_or_that_cannot_be_read_is_not_deleted(

@@ -27,9 +27,8 @@ from tcmrl_data import (
     open_sampler,
     parse_bytes,
 )
-from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
 from tcmrl_data.foundation.errors import CacheError, ManifestError, StoreError
-from tcmrl_data.foundation.records import sealed
+from tcmrl_data.foundation.records import canonical_json, digest, sealed, sha256
 from tcmrl_data.sampling import cache
 from tcmrl_data.sampling.cache import RECORD_BYTES, cached_rows
 from tcmrl_data.sampling.rows import Indices, PartRows, Table, fill_table, read_rows

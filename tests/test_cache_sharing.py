@@ -1,9 +1,6 @@
-"""The cache in several processes: one decodes while others wait, the limit is a cap, locks hold on NFS."""
+"""The cache in several processes: one decodes while others wait, and the limit is a cap."""
 
 import contextlib
-import errno
-import fcntl
-import os
 import shlex
 import subprocess
 import sys
@@ -14,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tcmrl_data import Dataset, Selection, clear_cache, list_cache, verify_cache
+from tcmrl_data import Dataset, Selection, list_cache
 from tcmrl_data.foundation import disk
 from tcmrl_data.foundation.disk import lock_file, lock_holder
 from tcmrl_data.foundation.errors import CacheError, LockedError
-from tcmrl_data.foundation.locks import try_exclusive_lock
+from tcmrl_data.foundation.files import try_exclusive_lock
 from tcmrl_data.sampling.cache import cached_rows, entry_bytes
 from tcmrl_data.sampling.rows import read_rows
 from tests.disks import read_only, run_mounted
@@ -138,35 +135,6 @@ def test_the_limit_is_a_cap(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> N
     cached_rows(large)
     (entry,) = list_cache()
     assert 0.5 * entry_bytes(large) < entry.bytes <= entry_bytes(large)
-
-
-flock = fcntl.flock
-
-
-def flock_by_access(file: Any, kind: int) -> None:
-    """A lock as on NFS: an exclusive one needs a file opened for writing, a shared one for reading."""
-    access = fcntl.fcntl(file, fcntl.F_GETFL) & os.O_ACCMODE
-    refused = {fcntl.LOCK_EX: os.O_RDONLY, fcntl.LOCK_SH: os.O_WRONLY}
-    if refused.get(kind & ~fcntl.LOCK_NB) == access:
-        raise OSError(errno.EBADF, os.strerror(errno.EBADF))
-    flock(file, kind)
-
-
-@pytest.fixture
-def nfs(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(fcntl, "flock", flock_by_access)
-
-
-@pytest.mark.usefixtures("nfs")
-def test_the_cache_works_on_nfs(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    old, new = tiny.select(tasks=[0]), tiny.select(tasks=[3])
-    cached_rows(old)
-    monkeypatch.setenv("TCMRL_CACHE_LIMIT", str(entry_bytes(new)))
-    rows = cached_rows(new)  # evicts the old one
-    assert [entry.in_use for entry in list_cache()] == [True]
-    assert verify_cache() == () and clear_cache() == ()
-    del rows
-    assert len(clear_cache()) == 1
 
 
 def test_a_removed_lock_is_not_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

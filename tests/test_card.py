@@ -11,8 +11,7 @@ from tcmrl_cli.data import data
 import tcmrl_data
 from tcmrl_data import Dataset
 from tcmrl_data.describe.card import BEGIN, END, dataset_card
-from tcmrl_data.foundation.canonical import parse_json
-from tcmrl_data.foundation.records import sealed
+from tcmrl_data.foundation.records import parse_json, sealed
 from tcmrl_data.quality.scores import measure_quality
 from tcmrl_data.store.manifest import MANIFEST
 from tests.commands import Call, assert_refused, in_process

@@ -16,12 +16,11 @@ import pytest
 import tcmrl_data
 from tcmrl_data import Recipe, load_recipe
 from tcmrl_data.behavior.base import CheckpointFolder, TrainingState
-from tcmrl_data.building.plan import plan_build
-from tcmrl_data.building.unit import UnitSpec, run_unit
+from tcmrl_data.building.plan import UnitSpec, plan_build, run_unit
 from tcmrl_data.building.work_files import STATUS, BuildEvent
 from tcmrl_data.engine.base import BaseEngine, Message, Result, Unit
-from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import CHECKPOINTS
+from tcmrl_data.foundation.records import digest, to_json
 from tests.conftest import TINY
 from tests.datasets import part_ids
 from tests.platforms import AVX2
@@ -190,9 +189,9 @@ SAVE_OR_LOAD = """
 import json, sys
 import numpy as np
 from tcmrl_data.behavior.base import TrainingState
-from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.building.unit import UnitSpec, _checkpoints
-spec = UnitSpec.from_json(json.loads(sys.argv[2]))
+from tcmrl_data.building.plan import BuildPlan, UnitSpec, _checkpoints
+from tcmrl_data.foundation.records import from_json
+spec = from_json(UnitSpec, json.loads(sys.argv[2]))
 plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks)
 checkpoints = _checkpoints(spec, plan, spec.tasks, {3: plan.source.steps}, print)
 if sys.argv[1] == "save":
@@ -203,7 +202,7 @@ print(checkpoints.load() is not None)
 
 @pytest.mark.check
 def test_a_checkpoint_of_another_platform_is_ignored(tiny_recipe: Recipe, tmp_path: Path) -> None:
-    spec = json.dumps(UnitSpec(tmp_path, tiny_recipe, 0, plan_build(tiny_recipe, tasks=[3]).tasks).to_json())
+    spec = json.dumps(to_json(UnitSpec(tmp_path, tiny_recipe, 0, plan_build(tiny_recipe, tasks=[3]).tasks)))
     found = [
         subprocess.run(
             [sys.executable, "-c", SAVE_OR_LOAD, command, spec],

@@ -12,7 +12,7 @@ import tcmrl_data
 from tcmrl_data import ENVIRONMENTS, BuildReport, Dataset, Recipe
 from tcmrl_data.foundation.records import sealed
 from tcmrl_data.store.manifest import MANIFEST
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 from tests.conftest import TASKS, TINY
 from tests.workers import ROOT
 
@@ -20,11 +20,6 @@ pytestmark = pytest.mark.usefixtures("module_in_process")
 
 Copy = Callable[[], Path]
 SETTINGS = [argument for text in TINY for argument in ("--set", text)]
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(data, capsys)
 
 
 def test_envs_lists_every_environment(call: Call) -> None:

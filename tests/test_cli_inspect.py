@@ -16,18 +16,13 @@ from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, open_dataset
 from tcmrl_data.store.manifest import Totals
-from tcmrl_data.verification.restoring import write_tables
-from tests.commands import Call, assert_refused, in_process
+from tcmrl_data.verification.repair import write_tables
+from tests.commands import Call, assert_refused
 from tests.conftest import TASKS
 from tests.terminal import as_in_terminal, assert_fits
 
 Copy = Callable[[], Path]
 MAIN = "from tcmrl_cli.data import main; main()"
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(data, capsys)
 
 
 def test_inspect_without_a_word_says_which_words_there_are(call: Call, tiny: Dataset) -> None:

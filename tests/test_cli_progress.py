@@ -9,7 +9,6 @@ from tcmrl_cli.data import data
 from tcmrl_cli.frame import duration, output_options
 from tcmrl_cli.progress import Pace, StageProgress
 
-from tcmrl_data.foundation.machine import size
 from tests.commands import in_process
 from tests.conftest import TINY
 from tests.terminal import as_in_terminal, assert_fits, show_in_terminal
@@ -112,8 +111,3 @@ def test_quiet_progress_says_nothing(capsys: pytest.CaptureFixture[str]) -> None
 )
 def test_durations(seconds: float, text: str) -> None:
     assert duration(seconds) == text
-
-
-@pytest.mark.parametrize(("num_bytes", "text"), [(999, "999 B"), (1_500, "1.5 kB"), (2.5e12, "2.5 TB")])
-def test_sizes(num_bytes: float, text: str) -> None:
-    assert size(num_bytes) == text

@@ -13,14 +13,8 @@ from tcmrl_cli.data import data
 from tcmrl_cli.frame import make_table, print_table
 
 from tcmrl_data import Dataset, recipe_values
-from tests import commands
 from tests.commands import Call
 from tests.terminal import as_in_terminal, assert_fits, in_terminal
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return commands.in_process(data, capsys)
 
 
 @pytest.fixture(scope="module")

@@ -6,20 +6,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, SelectionError, Trajectory, measure_coverage, measure_rewards
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.quality.coverage import Grid
 from tcmrl_data.quality.measured import PartSteps, read_steps
 from tcmrl_data.store.tables import PartKey
-from tests.commands import Call, in_process
+from tests.commands import Call
 from tests.graded import graded_dataset, made_dataset
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(data, capsys)
 
 
 def episode(positions: Sequence[float], rewards: Sequence[float] = ()) -> Trajectory:

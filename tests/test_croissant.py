@@ -14,7 +14,7 @@ import tcmrl_data
 from tcmrl_data import Dataset
 from tcmrl_data.building.work_files import CROISSANT, CROISSANT_FILES, CROISSANT_PARTS
 from tcmrl_data.describe.croissant import PART_FIELDS, write_croissant
-from tcmrl_data.foundation.canonical import sha256
+from tcmrl_data.foundation.records import sha256
 from tests.commands import in_process
 
 Copy = Callable[[], Path]

@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 
 from tcmrl_data import Dataset, list_datasets, open_dataset
-from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TaskError
-from tcmrl_data.foundation.records import sealed
+from tcmrl_data.foundation.records import canonical_json, digest, sealed
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part import RECORD
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
 from tcmrl_data.store.tables import TASKS as TASKS_TABLE
 from tcmrl_data.store.tables import PartKey, part_file, seal_of
-from tcmrl_data.verification.restoring import write_tables
+from tcmrl_data.verification.repair import write_tables
 from tests.conftest import TASKS
 
 Copy = Callable[[], Path]
@@ -100,60 +99,6 @@ def rewritten(folder: Path, **changes: object) -> None:
     values = json.loads((folder / MANIFEST).read_bytes()) | changes
     values.pop("digest")
     (folder / MANIFEST).write_bytes(sealed(values))
-
-
-def test_manifests_that_must_not_open(tiny_copy: Copy) -> None:
-    folder = tiny_copy()
-    file = folder / MANIFEST
-    good = file.read_bytes()
-    run = json.loads(good)["runs"][0]
-
-    def refuse(pattern: str) -> None:
-        with pytest.raises(ManifestError, match=pattern):
-            open_dataset(folder)
-        file.write_bytes(good)
-
-    file.write_bytes(good[: len(good) // 2])
-    refuse("not a manifest")
-    file.write_bytes(good.replace(b'"seed":0', b'"seed":1', 1))
-    refuse("digest does not match")
-    for changes, pattern in (
-        ({"schema_version": 3}, "schema_version 3 is not 2"),
-        ({"surprise": 1}, "surprise: Extra inputs"),
-        ({"runs": [run | {"seed": "0"}]}, "runs.0.seed: Input should be a valid integer"),
-        ({"runs": [run, run]}, "runs must have different names"),
-        ({"root": "0" * 63}, "root: "),
-        ({"name": "../etc"}, "name: "),
-        ({"parts": {"lines": 1_000_002, "bytes": 1, "sha256": "0" * 64}}, "at most 100000 tasks and 1000000"),
-    ):
-        rewritten(folder, **changes)
-        refuse(pattern)
-    file.unlink()
-    refuse("does not exist; build a dataset")
-    open_dataset(folder)
-
-
-@pytest.mark.parametrize("name", [TASKS_TABLE, PARTS_TABLE])
-@pytest.mark.parametrize("damage", ["missing", "shorter", "edited"])
-def test_a_damaged_table_is_named_when_it_is_first_used(
-    tiny_copy: Copy, tmp_path: Path, name: str, damage: str
-) -> None:
-    folder = tiny_copy()
-    file, moved = folder / name, tmp_path / "elsewhere"
-    content = file.read_bytes()
-    file.rename(moved)
-    if damage != "missing":
-        file.write_bytes(content[:-1] if damage == "shorter" else content.replace(b"0", b"1", 1))
-    dataset = open_dataset(folder)
-    with pytest.raises(ManifestError, match=str(file)):
-        _ = dataset.tasks if name == TASKS_TABLE else dataset.parts
-
-
-def test_a_table_of_another_root_is_refused(tiny_copy: Copy) -> None:
-    folder = tiny_copy()
-    rewritten(folder, root="0" * 64)
-    with pytest.raises(ManifestError, match="do not have the manifest's root"):
-        open_dataset(folder).select()
 
 
 def test_lines_behind_the_sealed_ones_do_not_count(tiny: Dataset, tiny_copy: Copy) -> None:

@@ -27,7 +27,7 @@ from tcmrl_data import (
     verify_dataset,
 )
 from tcmrl_data.envs.base import DENSE_REWARDS
-from tcmrl_data.envs.controller import UniformController
+from tcmrl_data.envs.rollout import UniformController
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.recipe.recipe import full_settings
 from tcmrl_data.sampling.cache import cached_rows, list_cache

@@ -12,9 +12,15 @@ from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import TIERS, Dataset, derive_dataset, open_dataset, verify_dataset
-from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, StoreError, TierError
-from tcmrl_data.foundation.records import count_ranges, read_ranges, sealed, write_ranges
+from tcmrl_data.foundation.records import (
+    canonical_json,
+    count_ranges,
+    digest,
+    read_ranges,
+    sealed,
+    write_ranges,
+)
 from tcmrl_data.store.manifest import MANIFEST, read_manifest
 from tcmrl_data.store.part import References
 from tcmrl_data.store.tables import PartKey, part_file

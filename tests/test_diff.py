@@ -14,7 +14,7 @@ from tcmrl_data import Dataset, derive_dataset, diff_datasets, extend_dataset, o
 from tcmrl_data.behavior.base import Snapshot
 from tcmrl_data.dataset.diff import why_not_published
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.operations.assembly import PlannedPart, derivation_of, open_assembly
 from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart

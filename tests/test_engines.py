@@ -18,13 +18,13 @@ import torch
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
 from tcmrl_data.building.build import WORKER
-from tcmrl_data.building.unit import UnitSpec
+from tcmrl_data.building.plan import UnitSpec
 from tcmrl_data.engine import local
 from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit, longest_first
 from tcmrl_data.engine.local import InProcessEngine, LocalEngine
-from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.records import digest, to_json
 from tcmrl_data.recipe.recipe import choose_tasks
 from tcmrl_data.store.manifest import read_manifest
 from tcmrl_data.store.tables import PartKey, part_file
@@ -84,7 +84,7 @@ def make_units(recipe: Recipe, out: Path, tasks: list[int]) -> list[Unit]:
     units = []
     for task in choose_tasks(recipe, tasks):
         spec = UnitSpec(out.resolve(), recipe, 0, (task,))
-        units.append(Unit(f"task {task.index}", spec.to_json(), WORKER))
+        units.append(Unit(f"task {task.index}", to_json(spec), WORKER))
     return units
 
 
@@ -264,7 +264,7 @@ def test_a_killed_driver_leaves_no_worker_and_the_same_command_goes_on(
 def test_a_worker_ends_with_its_driver(long_recipe: Recipe, tmp_path: Path) -> None:
     """It ends when its input closes, long before its unit is done."""
     (unit,) = make_units(long_recipe, tmp_path / "data", [40])
-    command = [sys.executable, "-m", "tcmrl_data.engine.worker", WORKER]
+    command = [sys.executable, "-m", "tcmrl_data.engine.local", WORKER]
     worker = subprocess.run(
         command, cwd=ROOT, text=True, input=json.dumps(unit.spec) + "\n", capture_output=True, check=False
     )
@@ -280,7 +280,7 @@ def test_a_worker_told_to_end_in_the_middle_of_publishing_leaves_nothing_half_do
     (unit,) = make_units(tiny_recipe, tmp_path / "data", [40])
     halfway = replace(directions, at="publishing").hold()
     directed = halfway.direct(unit)
-    command = [sys.executable, "-m", "tcmrl_data.engine.worker", directed.worker]
+    command = [sys.executable, "-m", "tcmrl_data.engine.local", directed.worker]
     with subprocess.Popen(
         command, cwd=ROOT, text=True, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as worker:
@@ -325,7 +325,7 @@ def test_the_engine_inside_the_process_returns_errors_and_raises_crashes(
     assert str(blocked) in str(failed.error)
     assert messages.count(("task 40", "part")) == 3
     crashing = replace(units[0], spec={**units[0].spec, "tasks": ["no task"]})
-    with pytest.raises(ValueError, match="unpack"):
+    with pytest.raises(ValueError, match="Input should be an object"):
         list(InProcessEngine().run([crashing], lambda unit, message: None))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from tcmrl_data.envs.base import ENVIRONMENTS
-from tcmrl_data.envs.controller import UniformController
+from tcmrl_data.envs.rollout import UniformController
 from tcmrl_data.foundation.errors import TaskError
 from tests.environments import ML1_IN_FULL, actions_of, environment_of, episodes, parameters_of
 

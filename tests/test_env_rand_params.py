@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tcmrl_data.envs.base import draw_tasks
-from tcmrl_data.envs.controller import UniformController
+from tcmrl_data.envs.rollout import UniformController
 from tcmrl_data.foundation.errors import TaskError
 from tests.environments import actions_of, environment_of, episodes, parameters_of
 

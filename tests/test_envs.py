@@ -8,7 +8,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from tcmrl_data.envs.base import ENVIRONMENTS, draw_tasks
-from tcmrl_data.envs.controller import UniformController
+from tcmrl_data.envs.rollout import UniformController
 from tcmrl_data.envs.simulation import SimulatedTask
 from tests.environments import actions_of, environment_of, episodes, parameters_of, play, some_members
 

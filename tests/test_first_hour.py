@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from tcmrl_cli import making
-from tcmrl_cli.data import data
 from tcmrl_cli.frame import footnotes
 from tcmrl_cli.train import tcmrl
 
@@ -31,11 +30,6 @@ from tests.small_training import config_of
 from tests.terminal import as_in_terminal
 
 Copy = Callable[[], Path]
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(data, capsys)
 
 
 @pytest.fixture(scope="module")

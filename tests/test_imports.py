@@ -180,7 +180,7 @@ def test_roots_load_nothing_until_asked_and_keep_what_they_promise(
 def test_a_worker_loads_torchs_compiler_only_if_it_compiles() -> None:
     code = (
         "import torch\n"
-        "from tcmrl_data.engine.worker import serve\n"
+        "from tcmrl_data.engine.local import serve\n"
         "def work(spec, report):\n"
         "    parameter = torch.nn.Parameter(torch.ones(2))\n"
         "    optimizer = torch.optim.Adam([parameter])\n"

@@ -1,6 +1,5 @@
 """Locks of writers: exclusive between processes and within one, and never disturbed by those who ask."""
 
-import fcntl
 import os
 import shutil
 import subprocess
@@ -11,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tcmrl_data import build_status
-from tcmrl_data.foundation import locks
+from tcmrl_data.foundation import files
 from tcmrl_data.foundation.disk import LOCK, lock_file, lock_holder
 from tcmrl_data.foundation.errors import LockedError
 from tests.disks import read_only, run_mounted
@@ -68,7 +67,6 @@ def ask(tiny_folder: Path) -> Iterator[None]:
 
 
 @pytest.mark.check
-@pytest.mark.skipif(not locks.HAS_OPEN_FILE_LOCKS, reason="with flock, a writer can be refused while asked")
 def test_no_writer_is_refused_while_others_ask(ask: None, tiny_folder: Path) -> None:
     for _ in range(STARTS):
         with lock_file(tiny_folder / LOCK, "dataset"):
@@ -76,13 +74,12 @@ def test_no_writer_is_refused_while_others_ask(ask: None, tiny_folder: Path) -> 
     assert lock_holder(tiny_folder / LOCK) is None
 
 
-@pytest.mark.skipif(not locks.HAS_OPEN_FILE_LOCKS, reason="with flock, asking takes the lock")
 def test_who_asks_takes_no_lock_even_if_suspended_before_closing_the_file(tmp_path: Path) -> None:
     (tmp_path / LOCK).touch()
     with (tmp_path / LOCK).open("rb") as asked:
-        assert not locks.is_locked(asked)
+        assert not files.is_locked(asked)
         with lock_file(tmp_path / LOCK, "dataset"):
-            assert locks.is_locked(asked)
+            assert files.is_locked(asked)
 
 
 def test_writers_exclude_each_other(tmp_path: Path) -> None:
@@ -93,12 +90,8 @@ def test_writers_exclude_each_other(tmp_path: Path) -> None:
     assert (tmp_path / "tally").read_text() == "600"
 
 
-@pytest.mark.parametrize("has_open_file_locks", [True, False])
-def test_two_writers_in_one_process_exclude_each_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_open_file_locks: bool
-) -> None:
+def test_two_writers_in_one_process_exclude_each_other(tmp_path: Path) -> None:
     """Also after somebody in the process asked, who opened and closed the file."""
-    monkeypatch.setattr(locks, "HAS_OPEN_FILE_LOCKS", has_open_file_locks and locks.HAS_OPEN_FILE_LOCKS)
     lock = tmp_path / LOCK
     own_name = f"process {os.getpid()} on {os.uname().nodename}"
     with lock_file(lock, "dataset"):
@@ -129,30 +122,3 @@ def test_status_of_a_dataset_that_can_only_be_read(tiny_folder: Path, tmp_path: 
     assert result.returncode == 0, result.stderr
     assert f"process {os.getpid()} on " in result.stdout
     assert build_status(folder).builder is None
-
-
-def test_without_open_file_locks_a_question_delays_a_writer_and_does_not_refuse_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lock = tmp_path / LOCK
-    lock.touch()
-    monkeypatch.setattr(locks, "HAS_OPEN_FILE_LOCKS", False)
-    with lock.open("rb") as reader:
-        fcntl.flock(reader, fcntl.LOCK_SH)
-        monkeypatch.setattr("time.sleep", lambda seconds: fcntl.flock(reader, fcntl.LOCK_UN))
-        with lock_file(lock, "dataset"):
-            assert lock_holder(lock) == f"process {os.getpid()} on {os.uname().nodename}"
-
-
-def test_without_open_file_locks_a_question_without_end_refuses_a_writer(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    lock, waits = tmp_path / LOCK, list[float]()
-    lock.touch()
-    monkeypatch.setattr(locks, "HAS_OPEN_FILE_LOCKS", False)
-    monkeypatch.setattr("time.sleep", waits.append)
-    with lock.open("rb") as reader:
-        fcntl.flock(reader, fcntl.LOCK_SH)
-        with pytest.raises(LockedError, match="another process"), lock_file(lock, "dataset"):
-            pass
-    assert 0.5 < sum(waits) < 10

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from tcmrl_data import Dataset, merge_datasets, open_dataset, repair_dataset, verify_dataset
-from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.errors import BuildError, SelectionError
+from tcmrl_data.foundation.records import canonical_json, sha256
 from tcmrl_data.operations.apply import apply_operation
 from tcmrl_data.parts.making import make_from
 from tcmrl_data.parts.operation import OPERATIONS, Operation, Simulator, Sources, StoredPart, WantedPart

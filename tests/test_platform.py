@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from tcmrl_data.foundation.canonical import canonical_json
+from tcmrl_data.foundation.records import canonical_json
 from tcmrl_data.store.part import Platform, this_platform
 from tests.environments import environment_of
 from tests.platforms import AVX2, BASELINE

@@ -5,18 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, measure_quality
 from tcmrl_data.quality.scores import bootstrap_interval, interquartile_mean, spread
 from tcmrl_data.store.part import References
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 from tests.graded import graded_dataset
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(data, capsys)
 
 
 def test_trajectory_quality_is_zero_for_uniform_and_one_for_oracle_returns(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ from tcmrl_data import (
     relabel_dataset,
     verify_dataset,
 )
-from tcmrl_data.envs.controller import PlaybackController
+from tcmrl_data.envs.rollout import PlaybackController
 from tcmrl_data.foundation.errors import BuildError, SelectionError, SimulationError
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.operations.assembly import PlannedPart, derivation_of, open_assembly

@@ -20,8 +20,7 @@ pytest.importorskip("obstore", reason="needs the extra `remote`")
 
 from tcmrl_data import TcmrlError, open_dataset, pull_dataset
 from tcmrl_data.dataset.listing import list_datasets
-from tcmrl_data.foundation.canonical import canonical_json, sha256
-from tcmrl_data.foundation.records import sealed
+from tcmrl_data.foundation.records import canonical_json, sealed, sha256
 from tcmrl_data.remote import objects
 from tcmrl_data.store.manifest import MANIFEST
 from tests.remotes import serving

@@ -12,17 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 from PIL import Image
-from tcmrl_cli.data import data
 
 import tcmrl_data
 from tcmrl_data import Dataset, FigureCamera, RenderingError, Trajectory, render_episode
 from tcmrl_data.describe.film import StoredEpisode, film, find_episode
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment
-from tcmrl_data.envs.controller import UniformController
+from tcmrl_data.envs.rollout import UniformController
 from tcmrl_data.envs.simulation import SimulatedTask, find_open_gl
 from tcmrl_data.foundation.errors import SelectionError, SimulationError
 from tcmrl_data.store.tables import PartKey
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 from tests.environments import environment_of, episodes, parameters_of, some_members
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
@@ -40,11 +39,6 @@ SIMULATED = (
     "rollouts.episodes=4",
     "rollouts.lanes=2",
 )
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(data, capsys)
 
 
 def stored_episode(name: str) -> tuple[Environment, StoredEpisode]:

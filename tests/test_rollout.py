@@ -15,7 +15,7 @@ from tcmrl_data import (
     roll_out,
 )
 from tcmrl_data.envs.base import Environment, LaneStep
-from tcmrl_data.envs.controller import BoolArray, FloatArray, ObservationView
+from tcmrl_data.envs.rollout import BoolArray, FloatArray, ObservationView
 from tests.environments import environment_of, parameters_of
 
 

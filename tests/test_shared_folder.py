@@ -4,8 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from tcmrl_data.foundation import locks
-from tcmrl_data.foundation.locks import wait_until_visible
+from tcmrl_data.foundation import files
+from tcmrl_data.foundation.files import wait_until_visible
 from tests.workers import PATIENCE
 
 
@@ -37,12 +37,12 @@ def test_pauses_grow_and_end_at_the_deadline(tmp_path: Path, monkeypatch: pytest
         pauses.append(seconds)
         now[0] += seconds
 
-    monkeypatch.setattr(locks.time, "sleep", sleep)
-    monkeypatch.setattr(locks.time, "monotonic", lambda: now[0])
-    listdir = locks.os.listdir
-    monkeypatch.setattr(locks.os, "listdir", lambda path: (listed.append(path), listdir(path))[1])
+    monkeypatch.setattr(files.time, "sleep", sleep)
+    monkeypatch.setattr(files.time, "monotonic", lambda: now[0])
+    listdir = files.os.listdir
+    monkeypatch.setattr(files.os, "listdir", lambda path: (listed.append(path), listdir(path))[1])
     assert not wait_until_visible(folder / "part.zip")
-    assert sum(pauses) == pytest.approx(locks.VISIBLE_SECONDS)
+    assert sum(pauses) == pytest.approx(files.VISIBLE_SECONDS)
     assert pauses[:-1] == sorted(pauses[:-1])
-    assert max(pauses) == locks.LONGEST_PAUSE
+    assert max(pauses) == files.LONGEST_PAUSE
     assert listed == [folder, tmp_path] * len(pauses)

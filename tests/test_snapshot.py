@@ -12,7 +12,7 @@ from tcmrl_data import Dataset, load_recipe
 from tcmrl_data.behavior.base import LOG_STD_RANGE, Snapshot, read_snapshot
 from tcmrl_data.behavior.sac import snapshot_of_sac
 from tcmrl_data.foundation.errors import SnapshotError
-from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.foundation.files import read_plain_file
 
 
 @pytest.fixture(scope="module")

@@ -69,7 +69,7 @@ def test_a_damaged_table_of_tasks_comes_back_with_the_fold(graded: Dataset, tmp_
 
 
 def test_a_fold_whose_table_has_another_split_is_found(graded: Dataset, tmp_path: Path) -> None:
-    from tcmrl_data.verification.restoring import write_tables
+    from tcmrl_data.verification.repair import write_tables
 
     fold = open_dataset(split_dataset(graded, tmp_path, folds=2)[1].out)
     write_tables(

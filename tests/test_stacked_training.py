@@ -17,11 +17,10 @@ from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder, Snapshot
 from tcmrl_data.behavior.stacked import StackedSource
 from tcmrl_data.behavior.stacked_training import GroupTraining
 from tcmrl_data.building.ledger import Ledger
-from tcmrl_data.building.plan import BuildPlan, plan_build
-from tcmrl_data.building.unit import UnitSpec, run_unit
-from tcmrl_data.foundation.canonical import canonical_json
+from tcmrl_data.building.plan import BuildPlan, UnitSpec, plan_build, run_unit
 from tcmrl_data.foundation.disk import CHECKPOINTS, make_folders
 from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.records import canonical_json, to_json
 from tcmrl_data.recipe.recipe import choose_tasks, group_tasks
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.tables import PartKey, part_file
@@ -326,14 +325,15 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
     )
     recipe = load_recipe("half-cheetah-vel", profile="quick", overrides=overrides, behavior="stacked")
     tasks = choose_tasks(recipe, range(20))
-    spec = canonical_json(UnitSpec(tmp_path, recipe, 0, tasks).to_json()).decode()
+    spec = canonical_json(to_json(UnitSpec(tmp_path, recipe, 0, tasks))).decode()
     program = (
         "import json, re, sys\n"
         "from pathlib import Path\n"
         "from tcmrl_data.behavior.base import CheckpointFolder\n"
-        "from tcmrl_data.building.unit import UnitSpec, run_unit\n"
+        "from tcmrl_data.building.plan import UnitSpec, run_unit\n"
+        "from tcmrl_data.foundation.records import from_json\n"
         "CheckpointFolder.is_due = lambda self: True\n"
-        "run_unit(UnitSpec.from_json(json.load(sys.stdin)), lambda message: None)\n"
+        "run_unit(from_json(UnitSpec, json.load(sys.stdin)), lambda message: None)\n"
         "print(1024 * int(re.search(r'VmHWM:\\s+(\\d+) kB', Path('/proc/self/status').read_text())[1]))\n"
     )
     done = subprocess.run(

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, SelectionError, TcmrlError, measure_transfer, measure_worth
 from tcmrl_data.behavior.base import GaussianDescription, Snapshot
@@ -14,14 +13,9 @@ from tcmrl_data.quality.transfer import Transfer, TransferTask
 from tcmrl_data.quality.worth import Half, Sample, context_worth, draw_sample, visibility
 from tcmrl_data.store.part import References
 from tcmrl_data.store.tables import PartKey
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 from tests.graded import graded_dataset, made_dataset
 from tests.test_coverage import episode
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(data, capsys)
 
 
 def walker(x: float) -> Snapshot:

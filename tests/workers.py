@@ -16,7 +16,7 @@ MARK = "TCMRL_TEST_MARK"
 ROOT = Path(__file__).parents[1]
 PATIENCE = 240.0
 """Seconds after which what is waited for counts as hanging; nothing depends on how long it takes."""
-WORKERS = (b"tcmrl_data.building.unit", b"tests.directed")
+WORKERS = (b"tcmrl_data.building.plan", b"tests.directed")
 
 
 def worker_pids(mark: str) -> list[int]:
@@ -27,7 +27,7 @@ def worker_pids(mark: str) -> list[int]:
 def _module(pid: int) -> bytes:
     """The module whose work a worker process does; empty for any other process."""
     _, _, entry, module = (*_read(pid, "cmdline").split(b"\0"), b"", b"", b"", b"")[:4]
-    return module if entry == b"tcmrl_data.engine.worker" else b""
+    return module if entry == b"tcmrl_data.engine.local" else b""
 
 
 def marked_pids(mark: str) -> list[int]:

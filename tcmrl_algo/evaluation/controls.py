@@ -28,10 +28,9 @@ from tcmrl_data import (
     first_observation,
     hidden_entries,
 )
-from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import make_folders
 from tcmrl_data.foundation.errors import StorageError
-from tcmrl_data.foundation.records import Frozen, read_record, write_record
+from tcmrl_data.foundation.records import Frozen, digest, read_record, write_record
 from tcmrl_data.foundation.seeding import evenly_spread
 
 

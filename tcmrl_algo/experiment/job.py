@@ -34,7 +34,7 @@ from tcmrl_algo.training.checkpoint import open_run, tensors_digest, write_run
 from tcmrl_algo.training.config import stage_plan
 from tcmrl_algo.training.train import TrainingProgress, resume_run, train_run
 from tcmrl_data import CheckpointError, Dataset, open_dataset
-from tcmrl_data.engine.worker import Send
+from tcmrl_data.engine.local import Send
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import DivergenceError
 from tcmrl_data.foundation.machine import processor

@@ -16,7 +16,7 @@ from tcmrl_data import (
     TcmrlError,
     TrainingError,
 )
-from tcmrl_data.foundation.canonical import leaves
+from tcmrl_data.foundation.records import leaves
 
 
 def plan_runs(

@@ -12,9 +12,8 @@ from typing import Any, Literal
 from pydantic import Field, model_validator
 
 from tcmrl_data import CheckpointError, Profile, TrainingError
-from tcmrl_data.foundation.canonical import leaves, parse_json
 from tcmrl_data.foundation.plugins import unknown_name
-from tcmrl_data.foundation.records import Frozen, validate_table
+from tcmrl_data.foundation.records import Frozen, leaves, parse_json, validate_table
 
 Metric = Literal[
     "final",

@@ -22,8 +22,7 @@ from tcmrl_algo.experiment.tunings import TrialRow, read_tuning, trial_rows
 from tcmrl_algo.report.sources import DatasetReturns, Source
 from tcmrl_algo.training.config import stage_plan
 from tcmrl_data import CheckpointError, Worth
-from tcmrl_data.foundation.canonical import digest
-from tcmrl_data.foundation.records import read_record
+from tcmrl_data.foundation.records import digest, read_record
 
 RUNS, CURVES, WORTH = "runs.csv", "curves.csv", "worth.csv"
 HEX_DIGITS = 16

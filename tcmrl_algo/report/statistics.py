@@ -12,7 +12,7 @@ from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_algo.experiment.results import RunResult, success_rate
 from tcmrl_algo.experiment.spec import Claim, Experiment, Metric
 from tcmrl_data import TrainingError
-from tcmrl_data.foundation.canonical import differences
+from tcmrl_data.foundation.records import differences
 
 FEWEST_SEEDS = 5
 """Below this many, the seeds themselves say more than an interval would."""

@@ -15,9 +15,8 @@ from torch import Tensor
 from tcmrl_algo.algorithms.core.problem import MomentsRecord
 from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_data import CheckpointError, Dataset, is_url, open_dataset
-from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import make_folders, publish_folder, remove_abandoned, remove_tree
-from tcmrl_data.foundation.records import Frozen, read_record, record_bytes, write_record
+from tcmrl_data.foundation.records import Frozen, read_record, record_bytes, sha256, write_record
 
 METRICS = "metrics.jsonl"
 EVALUATIONS = "evaluations.jsonl"

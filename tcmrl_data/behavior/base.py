@@ -26,13 +26,13 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter
 
 from tcmrl_data.envs.base import Environment, Parameters, Reward, Task
-from tcmrl_data.envs.controller import Controller, FloatArray, ObservationView
-from tcmrl_data.foundation.canonical import canonical_json, digest, parse_json, sha256
+from tcmrl_data.envs.rollout import Controller, FloatArray, ObservationView
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, named_errors, remove_tree, replace_file
 from tcmrl_data.foundation.errors import SnapshotError, StorageError, StoreError
+from tcmrl_data.foundation.files import one_line, printable
 from tcmrl_data.foundation.machine import DeferredInterrupts
-from tcmrl_data.foundation.plain_files import one_line, printable
 from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.foundation.records import canonical_json, digest, parse_json, sha256
 
 if TYPE_CHECKING:
     import torch
@@ -244,8 +244,10 @@ class CheckpointFolder:
 
     Args:
         key: digest of everything that the training depends on.
-        missing: by index of each incomplete task, its first missing snapshot step. A checkpoint at this step
-            or later is ignored, unless the task had failed by then.
+        missing: the first missing snapshot step of every incomplete task, by task index. A training that
+            continues from a checkpoint at this step or later would not make that snapshot again, so such a
+            checkpoint is ignored. It is used, however, if it records that the task's training has failed at
+            this step or before, because the snapshot will then never exist.
         seconds: minimum time between two checkpoints; 0 for as many as possible.
         warn: called once, with one line, when a checkpoint could not be written.
     """
@@ -381,7 +383,6 @@ class BehaviorContext:
     """What a source receives to make the policies of a unit, the tasks that are trained together.
 
     Attributes:
-        observation: the view that policies receive.
         reward: the reward that they are trained on.
         report: called with the number of environment steps since the last call.
         checkpoints: returns the checkpoint folder for a training of some tasks.

@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, Snapshot, TrainingState
 from tcmrl_data.envs.base import Environment, Task
-from tcmrl_data.envs.controller import ObservationView
+from tcmrl_data.envs.rollout import ObservationView
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 
 if TYPE_CHECKING:
@@ -34,7 +34,6 @@ class SacSettings(BaseModel):
 
     Attributes:
         hidden: widths of the actor's and the critics' ReLU layers.
-        steps: environment steps of training.
         warmup: uniform random steps before the first update (published code of CSRO: 2,000).
         snapshots: steps at which the policy is stored: 0, then steps after the warm-up (in which the policy
             does not change), up to `steps`.
@@ -291,7 +290,6 @@ def _optimizers(model: "SAC") -> dict[str, "Optimizer"]:
 
 
 def _tensors(model: "SAC") -> Iterator[tuple[str, Any]]:
-    """Names and tensors of all parameters and optimizer moments."""
     yield from ((f"policy.{name}", tensor) for name, tensor in model.policy.state_dict().items())
     if model.log_ent_coef is not None:
         yield "log_entropy_coefficient", model.log_ent_coef
@@ -301,7 +299,6 @@ def _tensors(model: "SAC") -> Iterator[tuple[str, Any]]:
 
 
 def _prepare_optimizers(model: "SAC") -> None:
-    """Creates the optimizers' moment tensors by a step with zero gradients."""
     import torch
 
     for optimizer in _optimizers(model).values():

@@ -19,12 +19,11 @@ import numpy.typing as npt
 from pydantic import ValidationError
 
 from tcmrl_data.behavior.base import GaussianDescription, Snapshot
-from tcmrl_data.envs.controller import ObservationView
-from tcmrl_data.foundation.canonical import parse_json
+from tcmrl_data.envs.rollout import ObservationView
 from tcmrl_data.foundation.disk import make_folders, write_tree
 from tcmrl_data.foundation.errors import SnapshotError
-from tcmrl_data.foundation.plain_files import one_line, open_plain_file, printable
-from tcmrl_data.foundation.records import first_problem
+from tcmrl_data.foundation.files import one_line, open_plain_file, printable
+from tcmrl_data.foundation.records import first_problem, parse_json
 
 LARGEST_FILE = 2**29
 FLOOR_BYTES = 2**20

@@ -102,7 +102,6 @@ class StackedSource(SacTraining):
 
 @contextlib.contextmanager
 def _matmul_precision(precision: str) -> Iterator[None]:
-    """Sets torch's precision of matrix products for the duration of a block."""
     import torch
 
     before = torch.get_float32_matmul_precision()

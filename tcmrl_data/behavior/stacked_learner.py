@@ -221,7 +221,6 @@ class StackedSac:
         self._make_buffers(settings.batch_size)
 
     def _adam(self, vectors: Sequence[tuple[Tensor, Tensor]]) -> Adam:
-        """Adam for (vector, gradient) pairs, with its moments created."""
         for vector, gradient in vectors:
             vector.grad = gradient
         optimizer = Adam([vector for vector, _ in vectors], lr=self.settings.learning_rate, fused=True)
@@ -274,7 +273,6 @@ class StackedSac:
         """One gradient step of every agent.
 
         Args:
-            batch: B transitions per agent.
             noise: (N, 2B, action_dim) standard normal; B for observations, then B for next observations.
         """
         batch_size = self.settings.batch_size

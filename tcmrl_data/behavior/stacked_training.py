@@ -16,7 +16,7 @@ from torch import Tensor
 from tcmrl_data.behavior.base import BehaviorContext, Snapshot, TrainingState
 from tcmrl_data.behavior.stacked import StackedSettings
 from tcmrl_data.behavior.stacked_learner import ReplayBatch, StackedSac
-from tcmrl_data.envs.controller import BoolArray, FloatArray
+from tcmrl_data.envs.rollout import BoolArray, FloatArray
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator, keyed_seed
 
@@ -123,11 +123,7 @@ class StackedReplay:
 
 @final
 class GroupTraining:
-    """N untrained agents and their environments.
-
-    Raises:
-        BuildError: the device of the settings does not exist.
-    """
+    """N untrained agents and their environments."""
 
     def __init__(self, context: BehaviorContext, settings: StackedSettings) -> None:
         if settings.device == "cuda" and not torch.cuda.is_available():

@@ -11,8 +11,7 @@ from typing import Any
 
 from tcmrl_data.behavior.base import CHECKPOINT_SECONDS
 from tcmrl_data.building.ledger import Ledger
-from tcmrl_data.building.plan import plan_build
-from tcmrl_data.building.unit import UnitSpec
+from tcmrl_data.building.plan import UnitSpec, plan_build
 from tcmrl_data.building.work_files import (
     ASSEMBLY,
     WORK_FILES,
@@ -25,11 +24,11 @@ from tcmrl_data.building.work_files import (
 from tcmrl_data.engine.base import BaseEngine, Result, Unit, make_engine
 from tcmrl_data.envs.base import ENVIRONMENTS, Task
 from tcmrl_data.envs.own import check_environment
-from tcmrl_data.foundation.canonical import differences
 from tcmrl_data.foundation.disk import LOCK, lock_file, make_folders, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, ReadOnlyError, StorageError
-from tcmrl_data.foundation.locks import VISIBLE_SECONDS
+from tcmrl_data.foundation.files import VISIBLE_SECONDS
 from tcmrl_data.foundation.machine import size
+from tcmrl_data.foundation.records import differences, to_json
 from tcmrl_data.parts.making import Published
 from tcmrl_data.recipe.recipe import Recipe, full_settings
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
@@ -48,7 +47,6 @@ class BuildReport:
     """What a build did.
 
     Attributes:
-        built: parts made now.
         present: parts that were there, with the recorded sizes.
         failed: one line per unit that failed.
         root: Merkle root of the dataset as it now stands.
@@ -80,7 +78,6 @@ def build_dataset(
     """Builds what is missing of a dataset; a finished one is left as it is.
 
     Args:
-        recipe: what to build.
         out: dataset folder: new, empty, or a dataset of the same recipe and seed, which is extended.
         seed: root seed of behavior training and rollouts.
         tasks: indices of the full task set instead of the profile's choice.
@@ -134,7 +131,6 @@ def build_dataset(
 
 
 def _check_folder(out: Path, recipe: Recipe, seed: int) -> None:
-    """Refuses a folder that is neither new nor a dataset of this recipe and seed."""
     if not out.exists():
         return
     is_dataset = (out / MANIFEST).is_file()  # files of others beside the data are `verify`'s to name
@@ -182,7 +178,7 @@ def _check_space(out: Path, needed: int, num_parts: int) -> None:
         )
 
 
-WORKER = "tcmrl_data.building.unit"
+WORKER = "tcmrl_data.building.plan"
 """Module that does a unit."""
 
 
@@ -235,7 +231,10 @@ class Driver:
                     if result.ok:
                         log.write(self._event("unit_done", f"{result.id} done", result.id))
                     else:
-                        failures.append(_failure(result))
+                        failures.append(
+                            f"{result.id} failed after {result.attempt} attempt(s) on {result.node}: "
+                            f"{result.error}"
+                        )
                         log.write(self._event("unit_failed", failures[-1], result.id))
         except KeyboardInterrupt:
             for group in groups:
@@ -247,7 +246,6 @@ class Driver:
         return tuple(sorted(failures))
 
     def _remarks(self) -> list[str]:
-        """What a user should know before the units start."""
         damaged = [
             f"{file} was damaged before it was recorded; it is made again" for file in self._ledger.damaged
         ]
@@ -268,7 +266,7 @@ class Driver:
         reserved = plan.recipe.build
         return Unit(
             _unit_id(tasks),
-            spec.to_json(),
+            to_json(spec),
             WORKER,
             cost=plan.source.training_steps * len(tasks),
             cpus=reserved.cpus,
@@ -278,7 +276,6 @@ class Driver:
         )
 
     def _checked(self, result: Result, tasks: Sequence[Task]) -> Result:
-        """A unit's result, failed where parts are still missing."""
         missing = self._take_in_unreported(tasks, deadline=self._deadline if result.ok else 0.0)
         if result.ok and missing:
             problem = f"it ended without {len(missing)} of its parts, the first is {part_file(missing[0])}"
@@ -319,7 +316,3 @@ class Driver:
 def _unit_id(tasks: Sequence[Task]) -> str:
     first, last = tasks[0].index, tasks[-1].index
     return f"task {first}" if len(tasks) == 1 else f"{len(tasks)} tasks from {first} to {last}"
-
-
-def _failure(result: Result) -> str:
-    return f"{result.id} failed after {result.attempt} attempt(s) on {result.node}: {result.error}"

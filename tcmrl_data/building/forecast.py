@@ -12,13 +12,13 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, CheckpointFolder, Snapshot
-from tcmrl_data.building.plan import BuildPlan
-from tcmrl_data.building.unit import PartMaker, UnitSpec
+from tcmrl_data.building.plan import BuildPlan, PartMaker, UnitSpec
 from tcmrl_data.engine.base import ENGINES, Unit
-from tcmrl_data.engine.worker import Send
+from tcmrl_data.engine.local import Send
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.machine import available_cores
+from tcmrl_data.foundation.records import from_json, to_json
 
 
 @dataclass(frozen=True)
@@ -58,15 +58,13 @@ def forecast_build(plan: BuildPlan, *, workers: int | None = None) -> Forecast:
     """What a build takes, from its plan and from a few seconds of measuring this machine.
 
     Args:
-        plan: of the build.
         workers: processes at a time; one per core where None.
     """
     recipe, environment, source, chosen = plan.recipe, plan.environment, plan.source, plan.tasks
     workers = workers or available_cores()
-    episodes, horizon = recipe.rollouts.episodes, environment.settings.horizon
     parts = len(chosen) * len(source.steps)
-    largest = max(plan.groups, key=len)
-    duration = estimate_duration(plan, workers)
+    episodes = parts * recipe.rollouts.episodes
+    seconds, low, high = estimate_seconds(plan, workers)
     return Forecast(
         environment=environment.name,
         profile=recipe.profile,
@@ -76,15 +74,15 @@ def forecast_build(plan: BuildPlan, *, workers: int | None = None) -> Forecast:
         test=sum(task.split == "test" for task in chosen),
         snapshots=len(source.steps),
         parts=parts,
-        episodes=parts * episodes,
+        episodes=episodes,
         training_steps=len(chosen) * source.training_steps,
-        rollout_steps=parts * episodes * horizon,
+        rollout_steps=episodes * environment.settings.horizon,
         bytes=parts * plan.part_bytes,
         workers=workers,
-        unit_bytes=plan.unit_bytes(len(largest)),
-        seconds=duration.seconds,
-        seconds_low=duration.seconds_low,
-        seconds_high=duration.seconds_high,
+        unit_bytes=plan.unit_bytes(max(map(len, plan.groups))),
+        seconds=seconds,
+        seconds_low=low,
+        seconds_high=high,
     )
 
 
@@ -92,15 +90,6 @@ WORKER = "tcmrl_data.building.forecast"
 PROBE_TIMEOUT = 600.0
 MARGIN = 0.15
 """Added to the spread of the measurements, for what varies over more than their few seconds."""
-
-
-@dataclass(frozen=True)
-class Duration:
-    """Wall time of a build in seconds: the expected one, and the ends of its spread."""
-
-    seconds: float
-    seconds_low: float
-    seconds_high: float
 
 
 @dataclass(frozen=True)
@@ -126,15 +115,10 @@ class Measurement:
     stretch: float
 
 
-def estimate_duration(plan: BuildPlan, workers: int) -> Duration:
-    """Measures as many of the largest units at once as will run at once, and adds up the build.
+def estimate_seconds(plan: BuildPlan, workers: int) -> tuple[float, float, float]:
+    """Wall time of a build, expected and at both ends of its spread.
 
-    Args:
-        plan: of the build.
-        workers: units that run at the same time.
-
-    Raises:
-        BuildError: a probe failed, as the build would.
+    Measures as many of the largest units at once as will run at once, and adds up the build.
     """
     source, sizes = plan.source, [len(group) for group in plan.groups]
     found = _measure(plan, min(workers, len(plan.groups)))
@@ -142,14 +126,13 @@ def estimate_duration(plan: BuildPlan, workers: int) -> Duration:
     stretch = max(one.stretch for one in found)
 
     def add_up(update: float, stretch: float) -> float:
+        start = _mean(found, "start") + _mean(found, "setup")
         task = task_seconds(source, found, update=update, stretch=stretch)
-        return makespan(
-            [_mean(found, "start") + _mean(found, "setup") + size * task for size in sizes], workers
-        )
+        return makespan([start + size * task for size in sizes], workers)
 
     middle = add_up(sum(updates) / len(updates), (1.0 + stretch) / 2)
     low, high = add_up(min(updates), 1.0), add_up(max(updates), stretch)
-    return Duration(middle, (1 - MARGIN) * low, (1 + MARGIN) * high)
+    return middle, (1 - MARGIN) * low, (1 + MARGIN) * high
 
 
 def task_seconds(
@@ -159,7 +142,6 @@ def task_seconds(
 
     Args:
         source: says how many of them there are.
-        found: what the probes measured.
         update: seconds per environment step with its updates.
         stretch: by how much rollouts take longer than the probes'.
     """
@@ -188,7 +170,7 @@ def _measure(plan: BuildPlan, number: int) -> list[Measurement]:
     units = [
         Unit(
             f"probe of task {group[0].index}",
-            UnitSpec(Path(), plan.recipe, plan.seed, group).to_json(),
+            to_json(UnitSpec(Path(), plan.recipe, plan.seed, group)),
             worker=WORKER,
             timeout=PROBE_TIMEOUT,
         )
@@ -265,7 +247,7 @@ def work(values: dict[str, Any], send: Send) -> str:
 
     torch.set_num_threads(1)  # as a build's workers
     send({"kind": "started"})
-    spec = UnitSpec.from_json(values)
+    spec = from_json(UnitSpec, values)
     plan = _probe_plan(spec)
     source = plan.source.with_warmup(WARMUP_STEPS)
     clock = Clock(source.warmup_steps * len(spec.tasks))

@@ -15,9 +15,8 @@ from tcmrl_data.foundation.errors import (
     StoreError,
     UnreadableError,
 )
-from tcmrl_data.foundation.locks import wait_until_visible
+from tcmrl_data.foundation.files import file_problem, folder_problem, status_of, wait_until_visible
 from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.foundation.plain_files import file_problem, folder_problem, status_of
 from tcmrl_data.parts.making import Published, read_published
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive
@@ -62,13 +61,11 @@ class Ledger:
 
     Attributes:
         plan: with the tasks of the dataset.
-        platforms: on which parts were made.
         num_parts: parts that are there, of those that the plan calls for.
         num_tasks_done: tasks of which no part is missing.
         damaged: files of parts that nothing had recorded when they were damaged; `begin` deletes them.
 
     Raises:
-        ManifestError: the manifest or a table is damaged.
         StoreError: a recorded part is missing or of another size, or a part is not of the plan.
     """
 
@@ -117,7 +114,6 @@ class Ledger:
 
         Raises:
             ReadOnlyError: the folder cannot be written.
-            StorageError: the operating system refuses an operation.
         """
         for file in self.damaged:
             with named_errors(file):
@@ -138,11 +134,7 @@ class Ledger:
         that the worker wrote, with a valid directory.
 
         Args:
-            published: the part.
             deadline: seconds to wait at most for a file that another machine has published.
-
-        Raises:
-            StoreError: the file is not what the worker wrote.
         """
         key = published.entry.key
         if key.step in self._steps[key.task]:
@@ -153,7 +145,9 @@ class Ledger:
                 raise StoreError(
                     f"{archive.path} has {archive.size} bytes, its worker wrote {published.entry.size}"
                 )
-        self._add(key)  # first: what Ctrl-C keeps from the table is not taken for missing and recorded twice
+        # Counted before its line is written: if Ctrl-C comes in between, `seal` writes the line, and the part
+        # is not found again as missing and recorded twice.
+        self._add(key)
         self._record(published)
         wait = max(SEAL_SECONDS, self._seal_seconds / SEAL_SHARE)
         if time.monotonic() - self._sealed > wait:
@@ -164,7 +158,6 @@ class Ledger:
         """Adds the parts of a task whose reports were lost; returns those that are missing or damaged.
 
         Args:
-            task: index of the task.
             deadline: seconds to wait at most for a file that another machine may have published.
         """
         missing = []
@@ -184,11 +177,7 @@ class Ledger:
         return nothing_new and self._is_written(self._manifest()) and not self._has_more()
 
     def seal(self) -> None:
-        """Writes the manifest and cuts off what stands behind the tables, unless this is so already.
-
-        Raises:
-            StorageError: the operating system refuses an operation; the old manifest is unchanged.
-        """
+        """Writes the manifest and cuts off what stands behind the tables, unless this is so already."""
         began = time.monotonic()
         unwritten = 1 + len(self._table) + len(self._new) - self._part_writer.seal.lines
         if unwritten:  # after Ctrl-C between the entry of a part and its line
@@ -210,12 +199,10 @@ class Ledger:
         return self._task_writer.has_more or self._part_writer.has_more
 
     def _kept_parts(self) -> PartTable:
-        """The parts of the tasks that were not dropped."""
         found = [published.entry for published in self._found]
         return self._table.with_entries([*self._new, *found]).without_tasks(self.plan.dropped)
 
     def _manifest(self) -> bytes:
-        """The manifest of what is there."""
         plan, earlier = self.plan, self._earlier
         main = Run(
             name=MAIN_RUN,
@@ -240,7 +227,6 @@ class Ledger:
         )
 
     def _record(self, published: Published) -> None:
-        """Appends a part's line to the table."""
         digest = published.platform.digest()
         digests = [platform.digest() for platform in self.platforms]
         if digest not in digests:
@@ -260,18 +246,13 @@ class Ledger:
             raise
 
     def _add(self, key: PartKey) -> None:
-        """Counts a part."""
         steps = self._steps[key.task]
         steps.add(key.step)
         self.num_parts += 1
         self.num_tasks_done += len(steps) == len(self.plan.source.steps)
 
     def _find_parts(self, log: bytes) -> None:
-        """Compares the tables with the files, and finds the parts that the tables do not name.
-
-        Raises:
-            StoreError: a recorded part is missing or of another size.
-        """
+        """Compares the tables with the files, and finds the parts that the tables do not name."""
         sizes = dict(self._scan())
         wanted = {PartKey(task, step) for task in self._steps for step in self.plan.source.steps}
         for key, size in zip(self._table, self._table.columns["size"].tolist(), strict=True):
@@ -290,11 +271,7 @@ class Ledger:
             self._add(published.entry.key)
 
     def _scan(self) -> Iterator[tuple[PartKey, int]]:
-        """The keys and sizes of all archives in the folders of the wanted tasks.
-
-        Raises:
-            StoreError: a folder or an archive is something that no build makes.
-        """
+        """The keys and sizes of all archives in the folders of the wanted tasks."""
         for task in self._steps:
             place = part_folder(PartKey(task, 0))
             blocked = folder_problem(self._out, place)
@@ -320,12 +297,7 @@ class Ledger:
             )
 
     def _read(self, key: PartKey) -> Published | None:
-        """A part that the tables do not name; None if it is damaged.
-
-        Raises:
-            StoreError: it is a sound part, but of other settings, another seed, another task or another
-                version, or the operating system refuses to read it.
-        """
+        """A part that the tables do not name; None if it is damaged."""
         file = self._out / part_file(key)
         try:
             published, record = read_published(file, key.run)

@@ -9,10 +9,10 @@ from typing import Any
 
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.engine.base import BaseEngine, NodeReport, Unit
-from tcmrl_data.engine.worker import Send
+from tcmrl_data.engine.local import Send
 from tcmrl_data.foundation.disk import STAGING, make_folders, write_file
 from tcmrl_data.foundation.errors import BuildError
-from tcmrl_data.foundation.locks import wait_until_visible
+from tcmrl_data.foundation.files import wait_until_visible
 from tcmrl_data.foundation.records import as_model
 from tcmrl_data.store.part import Platform
 
@@ -34,7 +34,6 @@ def check_nodes(engine: BaseEngine, plan: BuildPlan, out: Path) -> tuple[str, ..
 
     Args:
         engine: the build's engine; one that uses this machine alone has nothing to check.
-        plan: the build's plan.
         out: the dataset's folder, locked by the caller.
 
     Returns:
@@ -113,7 +112,6 @@ def _problem(report: NodeReport, here: Platform, out: Path) -> str | None:
 
 
 def _told(report: NodeReport) -> dict[str, Any]:
-    """All that the machine told."""
     return {name: value for message in report.messages for name, value in message.items()}
 
 

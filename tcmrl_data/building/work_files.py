@@ -17,11 +17,10 @@ from typing import Literal
 
 from pydantic import ValidationError
 
-from tcmrl_data.foundation.canonical import canonical_json, parse_json
 from tcmrl_data.foundation.disk import CHECKPOINTS, LOCK, STAGING, lock_holder, make_folders, place_file
 from tcmrl_data.foundation.errors import BuildError
-from tcmrl_data.foundation.plain_files import file_problem, read_plain_file
-from tcmrl_data.foundation.records import Record, as_model
+from tcmrl_data.foundation.files import file_problem, read_plain_file
+from tcmrl_data.foundation.records import Record, as_model, canonical_json, parse_json
 from tcmrl_data.store.manifest import MANIFEST_COPY, dataset_folder, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE
 from tcmrl_data.store.tables import PARTS, TASKS
@@ -59,11 +58,7 @@ def check_work_files(folder: Path, *, but: Collection[str] = ()) -> None:
     folder on another disk.
 
     Args:
-        folder: the dataset.
         but: files that may be anything, since they will be replaced and not written into.
-
-    Raises:
-        BuildError: names the file.
     """
     for name in sorted((WORK_FILES | WORK_FOLDERS | TABLES | {PARTS}) - {*but}):
         try:
@@ -111,10 +106,7 @@ class BuildEvent:
     """How far a build is.
 
     Attributes:
-        kind: what just happened.
-        unit: to which unit.
         steps_done: environment steps of behavior training, resumed ones included.
-        message: for people.
     """
 
     kind: EventKind
@@ -135,8 +127,6 @@ class _Status(Record):
         time: Unix time of the latest event.
         running: ids of the units at work, in the order of their first events.
         failed: messages of the latest failed units.
-        num_failed: how many units failed.
-        warnings: the latest ones.
         steps_per_second: environment steps of behavior training, over the latest minute; None if none.
     """
 
@@ -168,11 +158,7 @@ class StatusFile:
         self._paces: dict[int, tuple[float, int]] = {}  # second: time and steps of its first event
 
     def write(self, event: BuildEvent) -> None:
-        """Takes in an event, writes the status if it is time to, and reports the event.
-
-        Raises:
-            StorageError: the operating system refuses the operation.
-        """
+        """Takes in an event, writes the status if it is time to, and reports the event."""
         now, message = time.time(), event.message[:MESSAGE_CHARACTERS]
         if event.kind in ("unit_done", "unit_failed"):
             self._running.pop(event.unit or "", None)
@@ -222,7 +208,6 @@ class BuildStatus:
 
     Attributes:
         builder: the process that builds it now; null where none does.
-        running: units at work.
         failed: one line per unit that failed in the latest build, the latest 100.
         num_failed: units that failed in the latest build.
         steps_per_second: environment steps of behavior training, over the latest minute.

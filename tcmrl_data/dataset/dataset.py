@@ -16,9 +16,8 @@ from pydantic import ValidationError
 from tcmrl_data.behavior.base import Snapshot, read_snapshot
 from tcmrl_data.dataset.selection import Selection, ViewFile, chosen_parts, is_view_file, read_view
 from tcmrl_data.envs.base import Environment, Split, Task, draw_tasks
-from tcmrl_data.envs.controller import Trajectory
 from tcmrl_data.envs.own import OWN_ENVIRONMENTS
-from tcmrl_data.foundation.canonical import sha256
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.errors import (
     ManifestError,
     SelectionError,
@@ -29,8 +28,8 @@ from tcmrl_data.foundation.errors import (
     TrajectoryError,
     UnknownNameError,
 )
-from tcmrl_data.foundation.plain_files import one_line, read_plain_file
-from tcmrl_data.foundation.records import first_problem
+from tcmrl_data.foundation.files import one_line, read_plain_file
+from tcmrl_data.foundation.records import first_problem, sha256
 from tcmrl_data.remote.address import Address, is_url, parse_address
 from tcmrl_data.remote.files import RemoteFiles, open_remote
 from tcmrl_data.store.archive import Archive

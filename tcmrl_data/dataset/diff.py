@@ -10,8 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.foundation.canonical import differences, leaves
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.foundation.records import differences, leaves
 from tcmrl_data.remote.address import Address
 from tcmrl_data.store.part import STANDARD_ARRAYS, Identity
 from tcmrl_data.store.tables import PartKey
@@ -25,7 +25,6 @@ class Cause:
 
     Attributes:
         stage: the first stage of the pipeline that differs; later ones follow from it.
-        detail: what differs in it.
         platform: how the left part's platform (here) differs from the right one's (there).
     """
 
@@ -41,9 +40,6 @@ def first_cause(left: Dataset, right: Dataset, key: PartKey, *, decode: bool) ->
     Args:
         key: of a part that both have, with different ids.
         decode: also read policies and arrays, to name the first tensor, or the first step.
-
-    Raises:
-        StoreError: a part is damaged.
     """
     one, other = left.part(*key), right.part(*key)
     first, second = one.identity, other.identity
@@ -65,7 +61,6 @@ def first_cause(left: Dataset, right: Dataset, key: PartKey, *, decode: bool) ->
 
 
 def _fields(first: Identity, second: Identity) -> Iterator[tuple[Stage, str]]:
-    """The stages before the policy that differ, with the first value that does."""
     stages: tuple[tuple[Stage, Any, Any], ...] = (
         ("data version", first.data_version, second.data_version),
         ("settings", first.settings, second.settings),
@@ -79,7 +74,6 @@ def _fields(first: Identity, second: Identity) -> Iterator[tuple[Stage, str]]:
 
 
 def _value_difference(left: Any, right: Any) -> str:
-    """The first value that differs, by its place."""
     place, one, other = next(differences(left, right))
     return f"{place} {_short(one)} → {_short(other)}".strip()
 
@@ -108,7 +102,6 @@ def _order(name: str) -> tuple[int, str]:
 def _array_difference(
     left: Mapping[str, npt.NDArray[Any]], right: Mapping[str, npt.NDArray[Any]]
 ) -> str | None:
-    """The first step in which arrays differ, in words."""
     lengths = [np.diff(side["episode_offsets"]) for side in (left, right)]
     if len(lengths[0]) != len(lengths[1]):
         return f"{len(lengths[0])} episodes → {len(lengths[1])}"
@@ -167,7 +160,6 @@ class ReturnsDiff:
         left: mean over the tasks of the left dataset.
         right: mean over the tasks of the right one.
         low: lower end of Welch's 95% interval of the difference; None with fewer than two tasks in a dataset.
-        high: upper end.
     """
 
     left: float
@@ -182,9 +174,7 @@ class ObservationsDiff:
     """The observation column whose mean differs most.
 
     Attributes:
-        column: its position.
         left: its mean over all steps of the left dataset.
-        right: that of the right one.
         shift: right minus left in standard deviations of the left dataset; None where these are zero.
     """
 
@@ -240,7 +230,6 @@ def diff_datasets(
     """Compares two datasets and names the cause of the first difference.
 
     Args:
-        left: a dataset or a view.
         right: another one, of the same environment or not.
         level: `manifest` reads manifests and tables; `statistics` also the records of parts, with the moments
             of observations; `arrays` also decodes the first part that differs, to find its first row.
@@ -320,7 +309,6 @@ def _recipe(dataset: Dataset) -> dict[str, Any]:
 
 
 def _flat(values: Mapping[str, Any]) -> dict[str, Any]:
-    """The values of nested tables by their dotted names."""
     return {".".join(map(str, path)): value for path, value in leaves(values)}
 
 
@@ -335,7 +323,6 @@ def _runs(dataset: Dataset) -> dict[str, Any]:
 
 
 def _platforms(dataset: Dataset) -> dict[str, Any]:
-    """All values of every package and of everything else that a platform consists of."""
     found: dict[str, set[str]] = {}
     for platform in dataset.manifest.platforms:
         values = platform.model_dump(mode="json", exclude={"packages"}) | platform.packages
@@ -369,7 +356,11 @@ def _returns(left: Dataset, right: Dataset) -> ReturnsDiff | None:
     if min(map(len, samples)) > 1:
         half = _welch_half_width(samples)
         low, high = gap - half, gap + half
-    return ReturnsDiff(means[0], means[1], gap, low, high) if gap or _differ(samples) else None
+    return (
+        ReturnsDiff(means[0], means[1], gap, low, high)
+        if gap or not np.array_equal(samples[0], samples[1])
+        else None
+    )
 
 
 def _welch_half_width(samples: Sequence[npt.NDArray[np.float64]]) -> float:
@@ -386,10 +377,6 @@ def _welch_half_width(samples: Sequence[npt.NDArray[np.float64]]) -> float:
     shares = squares / squares.sum()
     freedom = 1.0 / sum(share**2 / (len(sample) - 1) for share, sample in zip(shares, samples, strict=True))
     return float(stats.t.ppf((1.0 + CONFIDENCE) / 2.0, freedom)) * error
-
-
-def _differ(samples: Sequence[npt.NDArray[np.float64]]) -> bool:
-    return not np.array_equal(samples[0], samples[1])
 
 
 def _last_means(dataset: Dataset) -> list[float]:

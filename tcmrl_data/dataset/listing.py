@@ -15,11 +15,11 @@ import numpy as np
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.selection import is_view_file
 from tcmrl_data.envs.base import Split, Task, place_in_order
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import MAX_JSON_BYTES
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.foundation.errors import ManifestError, RemoteError, SelectionError, TcmrlError
-from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.foundation.files import read_plain_file
+from tcmrl_data.foundation.records import MAX_JSON_BYTES
 from tcmrl_data.remote.address import Address, is_url, parse_address
 from tcmrl_data.remote.published import find_datasets
 from tcmrl_data.store.manifest import EPISODES, FOLD, MANIFEST, Derivation
@@ -48,7 +48,6 @@ def list_datasets(root: str | Path) -> list[dict[str, Any]]:
 
 
 def _paths(root: Path) -> Iterator[Path]:
-    """The datasets' folders and the files of views below a folder."""
     for folder, inner, files in os.walk(root):
         is_dataset = MANIFEST in files
         if is_dataset:
@@ -86,7 +85,6 @@ def dataset_row(dataset: Dataset) -> dict[str, Any]:
 
 
 def _derived(derivation: Derivation | None) -> str | None:
-    """How a dataset was derived, so that the folds of one source do not look alike."""
     if derivation is None:
         return None
     settings = derivation.settings
@@ -204,12 +202,7 @@ def list_snapshots(dataset: Dataset) -> dict[str, Any]:
 
 
 def list_episodes(dataset: Dataset, *, task: int | None = None, step: int | None = None) -> dict[str, Any]:
-    """Every episode: length, return, how it ended, and whether it succeeded at any step.
-
-    Raises:
-        TaskError: the dataset does not hold the task.
-        SelectionError: no part is left.
-    """
+    """Every episode: length, return, how it ended, and whether it succeeded at any step."""
     tasks = dataset.tasks if task is None else (dataset.task(task),)
     keys = [
         key for one in tasks for key in dataset.parts.keys_of(one.index) if step is None or key.step == step
@@ -226,11 +219,7 @@ def list_episodes(dataset: Dataset, *, task: int | None = None, step: int | None
 
 
 def summarize_returns(table: dict[str, Any]) -> list[dict[str, Any]]:
-    """One row per snapshot step and split: mean, std, min, max over the tasks' mean returns.
-
-    Args:
-        table: what `list_returns` made.
-    """
+    """One row per snapshot step and split: mean, std, min, max over the tasks' mean returns."""
     steps = sorted({found["step"] for task in table["tasks"] for found in task["snapshots"]})
     rows = []
     for step in steps:

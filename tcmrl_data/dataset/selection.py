@@ -21,7 +21,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.records import Record, count_ranges, read_ranges
 from tcmrl_data.store.manifest import MANIFEST, Derivation, Manifest, Totals, read_document
@@ -211,7 +211,6 @@ class ViewedParts(Record):
     Attributes:
         tasks: their indices, such as `0-9,12`.
         steps: of the snapshots, ascending.
-        run: of the parts.
     """
 
     tasks: str
@@ -234,10 +233,8 @@ class ViewFile(Record):
     Attributes:
         digest: sha256 of the canonical form of all other fields.
         source: the dataset's folder, relative to the view's.
-        source_root: root of that dataset.
         label: the view's own name.
         derivation: how the parts were chosen, and their splits if these are not the source's.
-        totals: over the parts.
         root: what the root of a dataset of these parts is.
     """
 
@@ -263,11 +260,7 @@ class ViewFile(Record):
         return frozenset(key for group in self.parts for key in group.keys)
 
     def manifest_of(self, source: Manifest, tasks: Iterable[int]) -> Manifest:
-        """The manifest of a dataset that holds the view's parts alone.
-
-        Args:
-            tasks: indices of the source's recorded tasks.
-        """
+        """The manifest of a dataset that holds the view's parts alone."""
         runs = [run.model_copy(update={"steps": None}) for run in source.runs]
         changes = {
             "digest": self.digest,

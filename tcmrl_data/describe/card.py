@@ -16,8 +16,8 @@ from tcmrl_data.describe.cite import citation_text
 from tcmrl_data.describe.viewer import viewer_configs, write_viewer
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import StoreError, TcmrlError
+from tcmrl_data.foundation.files import one_line, printable, read_plain_file
 from tcmrl_data.foundation.machine import size
-from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
 from tcmrl_data.quality.scores import Quality, measure_quality
 from tcmrl_data.recipe.recipe import load_recipe
 from tcmrl_data.store.manifest import FOREIGN_KINDS

@@ -133,7 +133,6 @@ def _reference_fields(work: Reference) -> dict[str, Any]:
 
 
 def _entry(key: str, fields: dict[str, Any]) -> str:
-    """A BibTeX entry of the fields that are set."""
     lines = [f"  {name} = {{{_bibtex_value(name, value)}}},\n" for name, value in fields.items() if value]
     return f"@misc{{{key},\n{''.join(lines)}}}\n"
 
@@ -219,7 +218,6 @@ def _reference_text(work: Reference) -> str:
 
 
 def _names(authors: Sequence[str]) -> str:
-    """Given names in front of family names, in the order of the authors."""
     readable = [
         f"{given.strip()} {family}" if given else family
         for family, _, given in (name.partition(",") for name in authors)

@@ -14,8 +14,8 @@ from typing import Any
 from tcmrl_data.building.work_files import CROISSANT, CROISSANT_PARTS, CROISSANT_TASKS
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.describe.cite import citation_of, citation_text
-from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.disk import STAGING, replace_file
+from tcmrl_data.foundation.records import canonical_json, sha256
 from tcmrl_data.recipe.document import is_listed
 from tcmrl_data.store.manifest import MANIFEST
 from tcmrl_data.store.part_table import PartEntry
@@ -75,9 +75,6 @@ def write_croissant(dataset: Dataset, folder: Path | None = None) -> Path:
     Args:
         dataset: a dataset, or a view if `folder` is another one than that of its source.
         folder: where to; the dataset's own where it is None.
-
-    Raises:
-        StorageError: the operating system refuses the operation.
     """
     target = dataset.folder if folder is None else folder
     files = {CROISSANT_TASKS: _task_lines(dataset), CROISSANT_PARTS: _part_lines(dataset)}

@@ -36,10 +36,7 @@ class ReportFigure:
     """A figure with a slider over its frames, if it has several.
 
     Attributes:
-        name: unique in its page.
         caption: what the reader sees, in a sentence or two.
-        layout: of all frames.
-        frames: at least one.
         slider: what the slider goes through, such as `task`; it starts at the last frame where `starts_last`.
     """
 
@@ -287,7 +284,6 @@ def silence(content: Content) -> ReportFigure:
 
 
 def _stage_lines(stages: Sequence[Any], **measures: str) -> list[Any]:
-    """Lines of measures by step, given the words for each field of a stage; the second is dotted."""
     lines = []
     for color, split in enumerate(SPLITS):
         own = [stage for stage in stages if stage.split == split]
@@ -409,11 +405,7 @@ def _heat_map(
 
     Args:
         z: (rows, columns).
-        unit: of the values.
         x: borders of what the columns divide; their centers are at 0, 1, … where None.
-        y: the same of the rows.
-        low: value of the first color.
-        high: value of the last one.
     """
     places: dict[str, float] = {}
     for name, borders, count in (("x", x, z.shape[1]), ("y", y, z.shape[0])):

@@ -9,15 +9,15 @@ import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.base import Camera, Environment, EnvironmentLanes, Picture
-from tcmrl_data.envs.controller import (
+from tcmrl_data.envs.rollout import (
     Controller,
     FloatArray,
     LaneTransition,
     ObservationView,
     PlaybackController,
     Trajectory,
+    roll_out,
 )
-from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.envs.simulation import check_chosen_open_gl
 from tcmrl_data.foundation.errors import RenderingError, SelectionError, SimulationError
 from tcmrl_data.foundation.seeding import Purpose, evenly_spread, keyed_seed
@@ -44,8 +44,6 @@ def find_episode(dataset: Dataset, key: PartKey, number: int) -> StoredEpisode:
 
     Raises:
         SelectionError: the dataset has no such part, or the part no such episode.
-        RenderingError: the seed of its reset is not known.
-        StoreError: the part is damaged.
     """
     identity = dataset.part(*key).identity
     if identity.seed is None:

@@ -11,7 +11,7 @@ from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.listing import dataset_summary, list_returns, list_tasks
 from tcmrl_data.describe.render import Strips, film_strips
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import FloatArray, Trajectory
+from tcmrl_data.envs.rollout import FloatArray, Trajectory
 from tcmrl_data.foundation.errors import SelectionError, TcmrlError
 from tcmrl_data.foundation.seeding import evenly_spread
 from tcmrl_data.quality.coverage import Coverage, measure_coverage
@@ -57,7 +57,6 @@ class Content:
         returns: the document of `inspect returns --json`.
         tasks: the document of `inspect tasks --json`.
         shown: tasks that are drawn one by one.
-        plane: in which states are drawn.
         endings: of the episodes of all parts, with their returns.
         paths: of the first, the middle and the last snapshot of the shown tasks.
         transfer: None unless it was asked for; as `strips`.
@@ -100,8 +99,6 @@ def measure(
 
     Raises:
         SelectionError: it has no parts, or too few tasks for `transfer`.
-        SnapshotError: a policy for `transfer` is missing.
-        StoreError: a part is missing or damaged.
     """
     entries = [entry for task in dataset.tasks for entry in dataset.parts.entries_of(task.index)]
     if not entries:
@@ -284,7 +281,6 @@ class StepEndings:
     """Episodes of one snapshot step.
 
     Attributes:
-        shortest, longest: steps of an episode.
         returns: number of episodes by return, in the bins of `EpisodeCounts.edges`.
     """
 
@@ -303,7 +299,6 @@ class EpisodeCounts:
 
     Args:
         low: smallest return of an episode in the dataset.
-        high: largest one.
 
     Attributes:
         edges: (RETURN_BINS + 1,) borders of the bins of returns.

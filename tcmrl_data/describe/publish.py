@@ -4,7 +4,7 @@ from pathlib import Path
 
 from tcmrl_data.dataset.dataset import open_dataset
 from tcmrl_data.describe.card import MAX_CARD_BYTES, write_card
-from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.foundation.files import read_plain_file
 from tcmrl_data.remote.files import Progress
 from tcmrl_data.remote.local import PushReport
 from tcmrl_data.remote.push import push_folder

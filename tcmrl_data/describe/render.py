@@ -151,11 +151,7 @@ class Strips:
 def film_strips(
     dataset: Dataset, tasks: Sequence[Task], *, progress: Callable[[int, int], None] | None = None
 ) -> Strips:
-    """Draws the first episode of the last snapshot of some tasks, until one cannot be drawn.
-
-    Raises:
-        StoreError: a part is damaged.
-    """
+    """Draws the first episode of the last snapshot of some tasks, until one cannot be drawn."""
     drawn: list[Strip] = []
     with tempfile.TemporaryDirectory() as folder:
         for task in tasks:
@@ -187,12 +183,6 @@ def _check_sizes(frames: int | None, width: int) -> None:
 
 
 def _find_part(dataset: Dataset, task: int, step: int | None, run: str) -> PartKey:
-    """The part of a task, snapshot and run.
-
-    Raises:
-        SelectionError: there is none; names the steps that there are.
-        TaskError: the dataset does not hold the task.
-    """
     steps = [key.step for key in dataset.parts.keys_of(dataset.task(task).index) if key.run == run]
     wanted = max(steps, default=0) if step is None else step
     if wanted not in steps:
@@ -237,14 +227,12 @@ def _titles(dataset: Dataset, episode: StoredEpisode) -> tuple[str, str]:
 
 
 def _film_frame(frame: Frame, titles: Sequence[str]) -> Picture:
-    """A frame below its titles, one a line, since it is narrow."""
     width = frame.picture.shape[1]
     bars = [_line_of_words(title, width, _bar_height(width)) for title in titles]
     return np.concatenate([*bars, _still(frame)])
 
 
 def _strip(frames: Sequence[Frame], title: str) -> Picture:
-    """All frames side by side, with gaps, below their title."""
     gap = ((0, 0), (0, GAP), (0, 0))
     stills = np.concatenate([np.pad(_still(frame), gap, constant_values=255) for frame in frames], axis=1)
     height = _bar_height(frames[0].picture.shape[1])
@@ -252,7 +240,6 @@ def _strip(frames: Sequence[Frame], title: str) -> Picture:
 
 
 def _still(frame: Frame) -> Picture:
-    """A frame above a line that says where it is."""
     width = frame.picture.shape[1]
     words = f"step {frame.steps:,}, return {frame.reward:,.2f}"
     return np.concatenate([frame.picture, _line_of_words(words, width, _bar_height(width))])
@@ -273,7 +260,6 @@ def _encode(pictures: Sequence[Picture], ending: str) -> bytes:
 
     Args:
         pictures: of a film in order, all of one size; of a strip, the finished strip alone.
-        ending: one of `ENDINGS`.
     """
     if ending == STRIP_ENDING:
         return _png(pictures[0])
@@ -310,11 +296,7 @@ def _webp(pictures: Sequence[Picture], shown: int) -> bytes:
 
 
 def _mp4(pictures: Sequence[Picture], shown: int) -> bytes:
-    """H.264, which browsers show.
-
-    Raises:
-        RenderingError: ffmpeg fails; the message has its last line.
-    """
+    """H.264, which browsers show."""
     height, width, _ = pictures[0].shape
     frames = [*pictures, *[pictures[-1]] * (LAST_MS // shown)]
     with tempfile.TemporaryDirectory() as folder:

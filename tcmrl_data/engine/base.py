@@ -22,7 +22,7 @@ class Unit:
     Attributes:
         id: name of the unit in messages and logs.
         spec: JSON values that the worker reads.
-        worker: module whose `work` the process calls, see `tcmrl_data.engine.worker`.
+        worker: module whose `work` the process calls, see `tcmrl_data.engine.local`.
         threads: threads of the process's numerical libraries.
         cost: relative duration; the longest unit starts first.
         cpus: cores to reserve, on engines that use several machines.
@@ -47,7 +47,6 @@ class Result:
     """How a unit ended.
 
     Attributes:
-        id: the unit's id.
         ok: True if the unit is done.
         digest: digest of the work done, if `ok`; equal work has equal digests.
         error: one line, if not `ok`.
@@ -126,12 +125,7 @@ ENGINES = Registry("tcmrl.engines", "engine", BaseEngine)
 def make_engine(
     engine: str | BaseEngine, workers: int | None = None, address: str | None = None
 ) -> BaseEngine:
-    """The engine of a name, with these arguments; an engine that is made already is used as it is.
-
-    Raises:
-        UnknownNameError: there is no engine of this name.
-        BuildError: an address is given, but the engine takes none.
-    """
+    """The engine of a name, with these arguments; an engine that is made already is used as it is."""
     return ENGINES.get(engine)(workers, address=address) if isinstance(engine, str) else engine
 
 

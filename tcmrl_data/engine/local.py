@@ -1,10 +1,18 @@
-"""The engines of this machine: a worker process per unit, or the work inside this process."""
+"""The engines of this machine: one worker process per unit, or the work inside this process.
+
+A worker is `python -m tcmrl_data.engine.local MODULE`. It reads a JSON spec from standard input, calls the
+module's `work` and writes messages to standard output as JSON lines; the last one is
+`{"kind": "result", "digest" | "error"}`. It ends when standard input closes, so that no worker outlives a
+killed driver. On SIGTERM or SIGINT it abandons the unit: a behavior training first writes its checkpoint,
+published parts stay, staged files are removed.
+"""
 
 import contextlib
 import importlib
 import json
 import os
 import queue
+import signal
 import socket
 import subprocess
 import sys
@@ -14,11 +22,12 @@ import time
 from collections.abc import Callable, Generator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from types import FrameType
 from typing import IO, Any, final
 
 from tcmrl_data.engine.base import ATTEMPTS, BaseEngine, Message, Result, Unit, longest_first
 from tcmrl_data.foundation.errors import TcmrlError
-from tcmrl_data.foundation.machine import available_cores
+from tcmrl_data.foundation.machine import available_cores, leave_out_compiler
 
 
 @final
@@ -93,9 +102,7 @@ def run_attempt(
     """Runs a unit in a worker process and waits for the process to end.
 
     Args:
-        unit: the unit.
         on_message: called from another thread with every message except the result.
-        stopping: ends the worker when set.
     """
     with contextlib.ExitStack() as stack:
         errors = stack.enter_context(tempfile.TemporaryFile("w+", errors="replace"))
@@ -121,7 +128,7 @@ def run_attempt(
 
 def _start_worker(unit: Unit, errors: IO[str]) -> "subprocess.Popen[str]":
     return subprocess.Popen(
-        [sys.executable, "-m", "tcmrl_data.engine.worker", unit.worker],
+        [sys.executable, "-m", "tcmrl_data.engine.local", unit.worker],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=errors,
@@ -164,7 +171,6 @@ def _wait(process: "subprocess.Popen[str]", timeout: float | None, stopping: thr
 
 
 def _end(process: "subprocess.Popen[str]") -> None:
-    """Sends SIGTERM to a worker, and SIGKILL if it does not end in time."""
     process.terminate()
     try:
         process.wait(GRACE_SECONDS)
@@ -219,3 +225,72 @@ def _run_unit(unit: Unit, on_message: Message) -> Result:
     finally:
         torch.set_num_threads(threads)
     return Result(unit.id, error is None, digest, error, 1, socket.gethostname())
+
+
+REPORT_SECONDS = 0.5
+
+Send = Callable[[Mapping[str, Any]], None]
+"""Receives a unit's messages. A message has a `kind`; messages of kind `steps` have a `count` to add up,
+messages of kind `warning` a `message` for people."""
+
+
+class _Reporter:
+    """Writes messages as JSON lines; step counts are added up and written twice a second."""
+
+    def __init__(self) -> None:
+        self._output = os.fdopen(os.dup(1), "w")
+        os.dup2(2, 1)  # the output of a library's print must not mix with messages
+        self._steps, self._sent = 0, time.monotonic()
+
+    def __call__(self, message: Mapping[str, Any]) -> None:
+        if message["kind"] == "steps":
+            self._steps += message["count"]
+            if time.monotonic() - self._sent < REPORT_SECONDS:
+                return
+        if self._steps:
+            self._write({"kind": "steps", "count": self._steps})
+            self._steps, self._sent = 0, time.monotonic()
+        if message["kind"] != "steps":
+            self._write(message)
+
+    def _write(self, message: Mapping[str, Any]) -> None:
+        self._output.write(json.dumps(message) + "\n")
+        self._output.flush()
+
+
+def _end_with_the_driver() -> None:
+    while os.read(0, 4096):  # not sys.stdin: holding its lock would abort the interpreter's shutdown
+        pass
+    os._exit(1)
+
+
+def _abandon(signal_number: int, frame: FrameType | None) -> None:
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)  # a second signal must not interrupt the cleanup
+    raise SystemExit(128 + signal_number)
+
+
+def serve(module: str) -> None:
+    """Runs the unit whose spec is the first line of standard input, reports its result and ends the process.
+
+    Args:
+        module: its `work` takes a spec and a receiver of messages, and returns the digest of the work done. A
+            `TcmrlError` that it raises becomes the unit's error; the unit is not tried again.
+    """
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, _abandon)
+    leave_out_compiler()
+    work = importlib.import_module(module).work
+    spec = json.loads(sys.stdin.readline())
+    threading.Thread(target=_end_with_the_driver, daemon=True).start()
+    report = _Reporter()
+    try:
+        report({"kind": "result", "digest": work(spec, report)})
+    except TcmrlError as error:
+        report({"kind": "result", "error": str(error)})
+    sys.stderr.flush()
+    os._exit(0)  # skips the shutdown of libraries, which takes a second
+
+
+if __name__ == "__main__":
+    serve(sys.argv[1])

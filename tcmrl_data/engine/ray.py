@@ -118,7 +118,6 @@ class _Run:
 
 
 def _supervise(unit: Unit, messages: Any) -> Result:
-    """Runs a unit on a machine of the cluster."""
     from ray.exceptions import RayError
 
     def on_message(message: Mapping[str, Any]) -> None:
@@ -235,11 +234,7 @@ def _knock(address: str) -> None:
 
 
 def _refuse_unplaceable(nodes: Sequence[Mapping[str, Any]], units: Sequence[Unit]) -> None:
-    """Checks that some machine can hold every unit; Ray would wait for ever for a larger one.
-
-    Raises:
-        BuildError: names the unit, the resources that it needs, and the machines.
-    """
+    """Checks that some machine can hold every unit; Ray would wait for ever for a larger one."""
     machines = [node["Resources"] for node in nodes if node["Alive"]]
     for unit in units:
         if not any(_fits(machine, unit) for machine in machines):
@@ -251,7 +246,6 @@ def _refuse_unplaceable(nodes: Sequence[Mapping[str, Any]], units: Sequence[Unit
 
 
 def _fits(machine: Mapping[str, float], unit: Unit) -> bool:
-    """A machine with these resources could run the unit if it had nothing else to do."""
     return all(machine.get(name, 0) >= amount for name, amount in _needed(unit).items())
 
 

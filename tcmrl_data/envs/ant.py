@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field
 
 from tcmrl_data.envs.base import EnvironmentSettings, ObservationView, Parameters, Reward
-from tcmrl_data.envs.controller import FloatArray
+from tcmrl_data.envs.rollout import FloatArray
 from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, Viewpoint, squared_norm
 
 if TYPE_CHECKING:

@@ -6,6 +6,7 @@ Lanes step several episodes together. The names of controllers and trajectories 
 import abc
 import importlib.resources
 import inspect
+import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint
@@ -19,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tcmrl_data.envs.controller import (
+from tcmrl_data.envs.rollout import (
     BoolArray,
     Controller,
     FloatArray,
@@ -27,7 +28,6 @@ from tcmrl_data.envs.controller import (
     ObservationView,
     Trajectory,
 )
-from tcmrl_data.envs.own import own_entries
 from tcmrl_data.foundation.errors import RecipeError, RenderingError
 from tcmrl_data.foundation.plugins import Registry, unknown_name
 from tcmrl_data.foundation.records import as_model
@@ -83,11 +83,8 @@ class EnvironmentSettings(BaseModel):
     """The `[environment]` table of a recipe; families add their own fields.
 
     Attributes:
-        name: the environment's name.
         task_seed: seed of the task parameters and of the split, by default that of the published code;
             independent of a build's `--seed`.
-        tasks: number of tasks.
-        train: number of training tasks.
         horizon: steps after which an episode is truncated.
         reward_density: `sparse` if few steps have a reward (paper, Appendix F.3).
         split: how test tasks are chosen. `permutation`: drawn from all tasks. `strata`: the tasks, sorted by
@@ -360,16 +357,25 @@ class EnvironmentLanes(Lanes):
             environment.close()
 
 
+def _own_entries() -> Sequence[EntryPoint]:
+    """The environments that `TCMRL_ENVIRONMENTS` names, of files that no package declares."""
+    if not os.environ.get("TCMRL_ENVIRONMENTS"):
+        return []
+    from tcmrl_data.envs.own import own_entries
+
+    return own_entries()
+
+
 @final
 class EnvironmentRegistry(Registry[Environment]):
     """Environments by name; one plug-in may provide several environments."""
 
     def names(self) -> list[str]:
-        return sorted({*super().names(), *(entry.name for entry in own_entries())})
+        return sorted({*super().names(), *(entry.name for entry in _own_entries())})
 
     def _entries(self) -> dict[str, list[EntryPoint]]:
         found = super()._entries()
-        for entry in own_entries():
+        for entry in _own_entries():
             found.setdefault(entry.name, []).append(entry)
         return found
 
@@ -420,7 +426,6 @@ class Task:
 
     Attributes:
         index: position in the full task set; the same in every profile and selection.
-        split: `train` or `test`.
         parameters: JSON values that define the task.
     """
 
@@ -482,7 +487,6 @@ def _strata(size: int, number: int) -> Iterator[tuple[int, int]]:
 
 
 def _rounded(value: Any) -> Any:
-    """A JSON value with all floats rounded."""
     if isinstance(value, float):
         return float(f"{value:.{PARAMETER_DIGITS}g}")
     if isinstance(value, dict):

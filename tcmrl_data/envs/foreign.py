@@ -16,8 +16,6 @@ class ForeignSettings(EnvironmentSettings):
         tasks: number of imported tasks, at least one.
         train: number of training tasks among them, possibly all.
         horizon: steps of the longest episode.
-        observation_dim: width of observations.
-        action_dim: width of actions.
         extra_arrays: dtypes of further per-step arrays, by name.
     """
 

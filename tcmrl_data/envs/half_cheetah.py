@@ -20,7 +20,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from tcmrl_data.envs.base import EnvironmentSettings, ObservationView, Parameters, Reward
-from tcmrl_data.envs.controller import FloatArray
+from tcmrl_data.envs.rollout import FloatArray
 from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, squared_norm
 
 DIRECTIONS = (-1.0, 1.0)

@@ -16,7 +16,7 @@ import numpy as np
 from pydantic import Field
 
 from tcmrl_data.envs.base import Controller, EnvironmentSettings, ObservationView, Parameters, Reward
-from tcmrl_data.envs.controller import FloatArray
+from tcmrl_data.envs.rollout import FloatArray
 from tcmrl_data.envs.simulation import SimulatedEnvironment, SimulatedTask, Viewpoint
 from tcmrl_data.foundation.errors import TaskError
 
@@ -144,7 +144,6 @@ class ExpertController(Controller):
     """Meta-World's scripted experts, one per lane; adds N(0, noise) to actions and clips them to [-1, 1].
 
     Args:
-        env_names: name of Meta-World's environment, per lane.
         noise: standard deviation of the noise (published data: 0.1).
     """
 

@@ -1,21 +1,20 @@
-"""A user's own environment: one in a file that no package declares, and the check before training."""
+"""A user's own environment: a new package for one, one in a file without a package, and its check."""
 
 import functools
 import importlib.util
 import os
+import re
 import sys
 from importlib.metadata import EntryPoint
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from tcmrl_data.envs.controller import FloatArray
+from tcmrl_data.envs.base import ENVIRONMENTS, Environment, draw_tasks
+from tcmrl_data.envs.rollout import FloatArray
 from tcmrl_data.foundation.errors import PluginError, SimulationError
 from tcmrl_data.foundation.plugins import one_line_error
-
-if TYPE_CHECKING:
-    from tcmrl_data.envs.base import Environment
 
 OWN_ENVIRONMENTS = "TCMRL_ENVIRONMENTS"
 """Environments in files, as FILE.py:CLASS, separated by commas; worker processes inherit it."""
@@ -56,8 +55,6 @@ def declare_file(target: str) -> str:
 
 @functools.cache
 def _load(target: str) -> Any:
-    from tcmrl_data.envs.base import Environment
-
     file, _, name = target.rpartition(":")
     module = f"tcmrl_own_{Path(file).stem}"
     spec = importlib.util.spec_from_file_location(module, file)
@@ -81,14 +78,12 @@ def _load(target: str) -> Any:
     return environments[name]
 
 
-def check_environment(environment: "Environment") -> None:
+def check_environment(environment: Environment) -> None:
     """Plays two episodes of uniform actions in the first task, with one seed, and looks at every step.
 
     Raises:
         SimulationError: the environment is not what it declares; the message names what to change.
     """
-    from tcmrl_data.envs.base import draw_tasks
-
     place = f"environment {environment.name!r}"
     task = draw_tasks(environment)[0]
     first, second = (_play(environment, task.parameters, place) for _ in range(2))
@@ -109,8 +104,7 @@ def check_environment(environment: "Environment") -> None:
             )
 
 
-def _play(environment: "Environment", parameters: Any, place: str) -> tuple[FloatArray, FloatArray]:
-    """The full observations and rewards of one episode of uniform actions."""
+def _play(environment: Environment, parameters: Any, place: str) -> tuple[FloatArray, FloatArray]:
     task = environment.make(parameters, view="full")
     try:
         return _steps(environment, task, place)
@@ -118,7 +112,7 @@ def _play(environment: "Environment", parameters: Any, place: str) -> tuple[Floa
         task.close()
 
 
-def _steps(environment: "Environment", task: Any, place: str) -> tuple[FloatArray, FloatArray]:
+def _steps(environment: Environment, task: Any, place: str) -> tuple[FloatArray, FloatArray]:
     _check_spaces(environment, task, place)
     draws, horizon = np.random.default_rng(CHECK_SEED), environment.settings.horizon
     observations, rewards = [_checked(environment, task.reset(seed=CHECK_SEED)[0], f"{place}: reset()")], []
@@ -143,7 +137,7 @@ def _steps(environment: "Environment", task: Any, place: str) -> tuple[FloatArra
     return np.array(observations), np.array(rewards)
 
 
-def _check_spaces(environment: "Environment", task: Any, place: str) -> None:
+def _check_spaces(environment: Environment, task: Any, place: str) -> None:
     from gymnasium.spaces import Box
 
     for noun, space in (("action", task.action_space), ("observation", task.observation_space)):
@@ -166,7 +160,7 @@ def _check_spaces(environment: "Environment", task: Any, place: str) -> None:
         )
 
 
-def _checked(environment: "Environment", observation: Any, at: str) -> FloatArray:
+def _checked(environment: Environment, observation: Any, at: str) -> FloatArray:
     found = np.asarray(observation)
     if found.shape != (environment.observation_dim,):
         raise SimulationError(
@@ -176,3 +170,51 @@ def _checked(environment: "Environment", observation: Any, at: str) -> FloatArra
     if not np.isfinite(found).all():
         raise SimulationError(f"{at} returned an observation with {found[~np.isfinite(found)][0]}")
     return found
+
+
+NAME = re.compile(r"[a-z][a-z0-9]*(-[a-z0-9]+)*")
+
+
+def new_environment(name: str, out: Path) -> list[Path]:
+    """Writes a package with an environment, its recipe and its tests, which builds as it stands.
+
+    Args:
+        name: of the environment, such as `mountain-car`.
+        out: a folder that does not exist yet.
+
+    Returns:
+        The files written, in the order in which they are read.
+
+    Raises:
+        PluginError: no such name is allowed, it is taken, or `out` exists.
+    """
+    import jinja2
+
+    if not NAME.fullmatch(name):
+        raise PluginError(
+            f"{name!r} is no name of an environment; use small letters, digits and -, such as my-env"
+        )
+    if name in ENVIRONMENTS.names():
+        raise PluginError(f"an environment {name!r} is installed already; choose another name")
+    if out.exists():
+        raise PluginError(f"{out} exists; choose another --out")
+    package = name.replace("-", "_")
+    files = {
+        f"{package}/environment.py": "environment.py.jinja",
+        f"{package}/{name}.toml": "recipe.toml.jinja",
+        "tests/test_environment.py": "test_environment.py.jinja",
+        "pyproject.toml": "pyproject.toml.jinja",
+        "README.md": "README.md.jinja",
+    }
+    templates = jinja2.Environment(  # Python and TOML, not HTML
+        loader=jinja2.PackageLoader("tcmrl_data.envs", "new"),
+        undefined=jinja2.StrictUndefined,
+        keep_trailing_newline=True,
+    )
+    values = {"name": name, "package": package, "class_name": "".join(map(str.capitalize, name.split("-")))}
+    (out / package).mkdir(parents=True)
+    (out / "tests").mkdir()
+    (out / package / "__init__.py").touch()
+    for file, template in files.items():
+        (out / file).write_text(templates.get_template(template).render(values), encoding="utf-8")
+    return [out / file for file in files]

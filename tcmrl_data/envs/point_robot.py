@@ -26,7 +26,7 @@ from tcmrl_data.envs.base import (
     Parameters,
     Reward,
 )
-from tcmrl_data.envs.controller import BoolArray, FloatArray
+from tcmrl_data.envs.rollout import BoolArray, FloatArray
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -105,7 +105,6 @@ class _PointRobot(Environment):
 
     @property
     def _reward_radius(self) -> float | None:
-        """Distance to the goal within which there is a reward; None if there is one everywhere."""
         return self.settings.goal_radius if self.settings.reward_density == "sparse" else None
 
     def oracle(self, parameters: Sequence[Parameters]) -> "GreedyController":
@@ -281,7 +280,6 @@ def draw_task(
     """Draws start, goal and wind of a task, and the half circle if the goal lies on it.
 
     Args:
-        parameters: goal and wind of the task.
         reward_radius: distance to the goal within which there is a reward; None if it is everywhere.
     """
     from matplotlib.patches import Circle

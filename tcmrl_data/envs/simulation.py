@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 
 from tcmrl_data.envs.base import Camera, Environment, Parameters, Picture
-from tcmrl_data.envs.controller import FloatArray
+from tcmrl_data.envs.rollout import FloatArray
 from tcmrl_data.foundation.errors import RenderingError
 
 OPEN_GL = ("egl", "osmesa")
@@ -127,11 +127,7 @@ class SimulatedTask(gymnasium.Env[FloatArray, FloatArray]):
         self._simulator.close()
 
     def camera(self, viewpoint: str | Viewpoint, *, width: int, height: int) -> Camera:
-        """A camera at one of the model's cameras or at a given place; width and height are in pixels.
-
-        Raises:
-            RenderingError: no OpenGL works on this machine.
-        """
+        """A camera at one of the model's cameras or at a given place; width and height are in pixels."""
         simulator: Any = self._simulator
         return _SimulationCamera(
             simulator.model, simulator.data, width=width, height=height, viewpoint=viewpoint

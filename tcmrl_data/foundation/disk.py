@@ -14,8 +14,7 @@ from pathlib import Path
 from typing import IO, Any, TextIO
 
 from tcmrl_data.foundation.errors import LockedError, ReadOnlyError, StorageError
-from tcmrl_data.foundation.locks import is_locked, try_exclusive_lock
-from tcmrl_data.foundation.plain_files import open_plain_file
+from tcmrl_data.foundation.files import is_locked, open_plain_file, try_exclusive_lock
 
 STAGING = ".staging"
 LOCK = ".lock"
@@ -67,11 +66,7 @@ disk = Disk()
 
 
 def write_file(path: Path, data: bytes) -> None:
-    """Writes a new file and forces its content, not its name, to disk.
-
-    Raises:
-        StorageError: the operating system refuses the operation.
-    """
+    """Writes a new file and forces its content, not its name, to disk."""
     with named_errors(path):
         disk.write(path, data)
         disk.sync(path)
@@ -95,11 +90,7 @@ def _make_staging(path: Path) -> None:
 
 
 def write_tree(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes files (relative path to content) into a new folder and forces them to disk.
-
-    Raises:
-        StorageError: the operating system refuses the operation.
-    """
+    """Writes files (relative path to content) into a new folder and forces them to disk."""
     folders = {folder, *(folder / parent for name in files for parent in Path(name).parents)}
     with named_errors(folder):
         for path in sorted(folders):
@@ -117,12 +108,8 @@ def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> Non
 
     Args:
         path: the file; missing parent folders are created.
-        data: the new content.
         staging: folder for the unfinished file; None, or a folder on another disk than the file's, writes a
             hidden file next to `path`.
-
-    Raises:
-        StorageError: the operating system refuses the operation; the old file is unchanged.
     """
     name = f"{path.name}.{uuid.uuid4().hex}"
     places = [path.with_name(f".{name}")]
@@ -149,9 +136,6 @@ def make_own(path: Path, *, num_bytes: int, staging: Path) -> None:
     """Replaces a file by a copy of its first bytes if it is a link, or has other names (hard links).
 
     What is then written into it changes no other file. A link to nothing is removed.
-
-    Raises:
-        StorageError: the operating system refuses an operation; the file is unchanged.
     """
     with named_errors(path):
         try:
@@ -176,11 +160,7 @@ def place_file(path: Path, data: bytes, *, staging: Path) -> None:
 
     Args:
         path: the file; missing parent folders are created.
-        data: the content.
         staging: folder for the unfinished file; it exists.
-
-    Raises:
-        StorageError: the operating system refuses an operation.
     """
     temporary = staging / f"{path.name}.{uuid.uuid4().hex}"
     with named_errors(path):
@@ -197,11 +177,7 @@ def place_file(path: Path, data: bytes, *, staging: Path) -> None:
 
 
 def sync_files(root: Path, files: Iterable[Path]) -> None:
-    """Forces files below a folder to disk: their contents first, then their names and those of their folders.
-
-    Raises:
-        StorageError: the operating system refuses an operation.
-    """
+    """Forces files below a folder to disk: first their contents, then their names and their folders'."""
     files = list(files)
     parents = {file.parent for file in files}
     folders = {
@@ -222,15 +198,9 @@ def publish_folder(root: Path, target: Path, files: Mapping[str, bytes], *, atte
 
     Args:
         root: folder whose staging area is used, such as a dataset's.
-        target: path inside `root`; its parent exists.
-        files: relative path to content.
-        attempt: prefix of the staging folder's name.
 
     Returns:
         False if `target` already exists; nothing is changed then.
-
-    Raises:
-        StorageError: the operating system refuses the operation; nothing is published.
     """
     staging = root / STAGING
     _make_staging(staging)
@@ -245,11 +215,7 @@ def publish_folder(root: Path, target: Path, files: Mapping[str, bytes], *, atte
 
 
 def move_into_place(staged: Path, target: Path) -> bool:
-    """Renames a synced folder to its final path; returns False if a non-empty folder is already there.
-
-    Raises:
-        StorageError: the operating system refuses the operation.
-    """
+    """Renames a synced folder to its final path; returns False if a non-empty folder is already there."""
     with named_errors(target):
         try:
             disk.rename(staged, target)
@@ -281,14 +247,6 @@ def require_room(file: Path, num_bytes: int, *, remedy: str = GO_ON) -> None:
     """Checks that a file can grow, or be created, for libraries that fail badly on a full disk.
 
     The bytes are reserved briefly in an unnamed file, so that quotas and file size limits are checked too.
-
-    Args:
-        file: the file; its folder exists.
-        num_bytes: growth of the file.
-        remedy: end of the error message.
-
-    Raises:
-        StorageError: the file cannot grow by `num_bytes`.
     """
     with named_errors(file, remedy=remedy), tempfile.TemporaryFile(dir=file.parent) as scratch:
         size = file.stat().st_size if file.exists() else 0
@@ -305,7 +263,6 @@ def lock_file(path: Path, what: str) -> Iterator[Path]:
     Raises:
         LockedError: another process holds the lock; the message names that process.
         ReadOnlyError: the folder cannot be written.
-        StorageError: the file system has no locks.
     """
     with contextlib.ExitStack() as stack:
         file = stack.enter_context(_open_lock(path))
@@ -348,7 +305,6 @@ def _open_lock(path: Path) -> TextIO:
 
 
 def _open_no_link(path: str, flags: int) -> int:
-    """Opens a file as `open` does, but no link."""
     return os.open(path, flags | os.O_NOFOLLOW | os.O_CLOEXEC, 0o666)
 
 

@@ -25,10 +25,7 @@ def render_page(
 
     Args:
         template: name of a template that extends `page.html.jinja`; it may import `blocks.html.jinja`.
-        folder: of the template.
-        title: of the page.
         scripts: JavaScript that runs at the end of the page.
-        values: what the template shows, by name.
     """
     sections: dict[str, str] = {}
 

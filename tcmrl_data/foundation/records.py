@@ -1,21 +1,124 @@
-"""Records as JSON files, and strict parsing of untrusted ones."""
+"""Canonical JSON, which gives equal values equal digests; records as JSON files; strict parsing of both."""
 
 import difflib
+import hashlib
 import json
+import math
 import re
 import types
 import typing
 import unicodedata
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
-from tcmrl_data.foundation.canonical import canonical_json, digest
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import CheckpointError, ManifestError, TcmrlError
-from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.files import printable
+
+MAX_JSON_BYTES = 16 * 2**20
+
+MAX_JSON_VALUES = 2**17
+"""An empty list takes 3 bytes of text and 64 of memory."""
+
+MAX_JSON_DEPTH = 32
+
+
+def canonical_json(value: Any) -> bytes:
+    """JSON with sorted keys, no spaces, ASCII only, no NaN, and floats in the shortest round-trip form."""
+    text = json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=True, allow_nan=False)
+    return text.encode("ascii") + b"\n"
+
+
+def sha256(data: bytes | memoryview) -> str:
+    """The sha256 of data, in hexadecimal."""
+    return hashlib.sha256(data).hexdigest()
+
+
+def digest(value: Any) -> str:
+    """The sha256 of a value's canonical JSON, in hexadecimal."""
+    return sha256(canonical_json(value))
+
+
+def leaves(tables: Mapping[str, Any], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Path and value of every value within nested tables; an empty table counts as a value."""
+    for key, value in tables.items():
+        if isinstance(value, Mapping) and value:
+            yield from leaves(value, (*path, key))
+        else:
+            yield (*path, key), value
+
+
+def differences(left: Any, right: Any, place: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Place, such as `sac.steps`, and both values of everything that differs in two JSON values.
+
+    A key that one object lacks has the value None there; lists are compared whole.
+    """
+    if isinstance(left, Mapping) and isinstance(right, Mapping):
+        for name in sorted({*left, *right}):
+            inner = f"{place}.{name}" if place else str(name)
+            yield from differences(left.get(name), right.get(name), inner)
+    elif left != right:
+        yield place, left, right
+
+
+def parse_json(data: bytes) -> Any:
+    """Parses untrusted JSON; limits size, number of values and depth.
+
+    Raises:
+        ValueError: the data exceeds a limit, is invalid JSON, or holds duplicate keys, NaN or infinity. The
+            message does not name the file; callers add the name.
+    """
+    if len(data) > MAX_JSON_BYTES:
+        raise ValueError(f"{len(data)} bytes of JSON exceed the limit of {MAX_JSON_BYTES}")
+    if sum(map(data.count, (b",", b"[", b"{"))) > MAX_JSON_VALUES:
+        raise ValueError(f"JSON holds more than {MAX_JSON_VALUES} values")
+    if _depth(data) > MAX_JSON_DEPTH:
+        raise ValueError(f"JSON is nested deeper than {MAX_JSON_DEPTH}")
+    return json.loads(
+        data.decode("utf-8"),
+        object_pairs_hook=_unique,
+        parse_constant=_no_constant,
+        parse_float=_finite,
+    )
+
+
+def _depth(data: bytes) -> int:
+    """An upper bound of the nesting depth, computed without recursion; it counts brackets in strings too."""
+    depth = deepest = 0
+    for byte in data.translate(None, delete=_NO_BRACKETS):
+        if byte in b"[{":
+            depth += 1
+            deepest = max(deepest, depth)
+        else:
+            depth -= 1
+    return deepest
+
+
+_NO_BRACKETS = bytes(set(range(256)) - set(b"[]{}"))
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) < len(pairs):
+        seen: set[str] = set()
+        duplicate = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        raise ValueError(f"duplicate key {duplicate[:80]!r}")
+    return result
+
+
+def _no_constant(name: str) -> NoReturn:
+    raise ValueError(f"{name} is not allowed")
+
+
+def _finite(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text[:40]} is too large for a number")
+    return value
+
 
 HIDDEN_CATEGORIES = {"Cc", "Cf", "Cs", "Zl", "Zp"}
 """Unicode categories of control, format and surrogate characters and of line separators."""
@@ -37,23 +140,26 @@ class Record(Frozen):
 
 
 Kind = TypeVar("Kind", bound=BaseModel)
+Value = TypeVar("Value")
 
 
 def as_model(kind: type[Kind], values: Any) -> Kind:
-    """Parsed JSON as a model; strict, except that a list is taken for a tuple, which JSON has no word for.
-
-    Raises:
-        ValidationError: the values are not valid.
-    """
+    """Parsed JSON as a model; strict, except that a list is taken for a tuple, which JSON has no word for."""
     return kind.model_validate_json(canonical_json(values))
 
 
-def write_record(file: Path, record: BaseModel) -> None:
-    """Writes a record as JSON, atomically.
+def to_json(value: Any) -> Any:
+    """A dataclass of models, paths and plain values as JSON, which `from_json` reads."""
+    return TypeAdapter(type(value)).dump_python(value, mode="json")
 
-    Raises:
-        StorageError: the operating system refuses the operation; the old file is unchanged.
-    """
+
+def from_json(kind: type[Value], values: Any) -> Value:
+    """The dataclass that `to_json` wrote."""
+    return TypeAdapter(kind).validate_json(canonical_json(values))
+
+
+def write_record(file: Path, record: BaseModel) -> None:
+    """Writes a record as JSON, atomically."""
     replace_file(file, record_bytes(record))
 
 
@@ -62,26 +168,21 @@ def record_bytes(record: BaseModel) -> bytes:
     return (record.model_dump_json(indent=1, by_alias=True) + "\n").encode()
 
 
-def read_record(
-    kind: type[Kind], file: Path, *, remedy: str = "", error: type[TcmrlError] = CheckpointError
-) -> Kind:
+def read_record(kind: type[Kind], file: Path, *, remedy: str = "") -> Kind:
     """Reads a record written by `write_record`.
 
     Args:
-        kind: class of the record.
-        file: the JSON file.
         remedy: end of the message if the content is not valid.
-        error: class of the error to raise.
 
     Raises:
-        TcmrlError: of class `error`: the file is missing, or its content is not a valid `kind`.
+        CheckpointError: the file is missing, or its content is not a valid `kind`.
     """
     try:
         return kind.model_validate_json(file.read_bytes())
     except OSError as problem:
-        raise error(f"{file} cannot be read: {problem.strerror}") from None
+        raise CheckpointError(f"{file} cannot be read: {problem.strerror}") from None
     except ValidationError as problem:
-        raise error(f"{file}: {first_problem(problem)}{remedy}") from None
+        raise CheckpointError(f"{file}: {first_problem(problem)}{remedy}") from None
 
 
 def sealed(fields: Mapping[str, Any]) -> bytes:
@@ -95,10 +196,6 @@ def parse_record(
     """Validates parsed JSON strictly as a record of a dataset.
 
     Args:
-        kind: class of the record.
-        values: the JSON.
-        file: where it comes from, for messages.
-        version: its schema version.
         data: the file's content where it holds its own digest, which is compared before anything else.
 
     Raises:
@@ -168,10 +265,7 @@ def validate_table(
     """Validates a table strictly, except that a list is accepted for a tuple.
 
     Args:
-        kind: the settings class.
-        values: the table, as parsed from TOML.
         place: origin of the table, for the error message.
-        error: class of the error to raise.
         table: dotted path of the table within its origin.
 
     Raises:
@@ -193,7 +287,6 @@ def first_problem(error: ValidationError, *, kind: type[BaseModel] | None = None
     """The first problem of a validation error in one line: field, rule, value.
 
     Args:
-        error: the error raised by pydantic.
         kind: the settings class; if given, the message for an unknown key suggests similar keys.
         table: dotted path to put in front of the field.
     """
@@ -253,10 +346,6 @@ def write_ranges(indices: Iterable[int]) -> str:
 
 def read_ranges(text: str, *, limit: int) -> list[int]:
     """The inverse of `write_ranges`, for text of unknown origin.
-
-    Args:
-        text: the text.
-        limit: indices lie below it.
 
     Raises:
         ValueError: the text is not one that `write_ranges` gives, or an index is too large.

@@ -58,9 +58,6 @@ def keyed_sequence(
 
     Args:
         root: the seed of the build, the task set or the run; any non-negative integer.
-        environment: the environment's name.
-        task: the task's index, or NO_TASK.
-        purpose: the stream's purpose.
         index: further coordinates, such as (snapshot step, episode).
 
     Raises:

@@ -19,8 +19,7 @@ import numpy.typing as npt
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Split, Task
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import canonical_json
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.disk import (
     disk,
     lock_file,
@@ -34,8 +33,9 @@ from tcmrl_data.foundation.disk import (
     write_file,
 )
 from tcmrl_data.foundation.errors import MissingPackageError, StorageError, StoreError
-from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.foundation.files import read_plain_file
 from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.foundation.records import canonical_json
 from tcmrl_data.interchange.reader import EPISODE_ARRAYS, FORMAT_VERSION
 from tcmrl_data.recipe.document import AND
 from tcmrl_data.store.tables import PartKey

@@ -29,7 +29,7 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.interchange.exporting import Format, transitions
 from tcmrl_data.interchange.hdf5_file import Hdf5File, new_file

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.files import printable
 from tcmrl_data.interchange.reader import (
     DAMAGE,
     TASK_ATTRIBUTES,

@@ -36,11 +36,11 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import parse_json
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.disk import disk, named_errors
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
+from tcmrl_data.foundation.files import one_line, printable, read_plain_file
+from tcmrl_data.foundation.records import parse_json
 from tcmrl_data.interchange.exporting import REMEDY, Format
 from tcmrl_data.interchange.reader import (
     DAMAGE,

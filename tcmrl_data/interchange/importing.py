@@ -12,11 +12,10 @@ from typing import Any
 import numpy as np
 
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, digest
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.errors import StoreError, TaskError
-from tcmrl_data.foundation.plain_files import one_line, printable, read_plain_file
-from tcmrl_data.foundation.records import hidden_text, validate_table
+from tcmrl_data.foundation.files import one_line, printable, read_plain_file
+from tcmrl_data.foundation.records import MAX_JSON_BYTES, digest, hidden_text, validate_table
 from tcmrl_data.interchange.exporting import require_packages
 from tcmrl_data.interchange.reader import READERS, Reader, ReadPart, Say, damage_at
 from tcmrl_data.operations.assembly import derivation_of, open_assembly

@@ -34,10 +34,10 @@ from gymnasium.utils import RecordConstructorArgs
 from tcmrl_data.dataset.dataset import Dataset, TaskReferences
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment, Task, make_environment
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.plain_files import one_line, read_plain_file
+from tcmrl_data.foundation.files import one_line, read_plain_file
+from tcmrl_data.foundation.records import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.seeding import Purpose, keyed_seed
 from tcmrl_data.interchange.exporting import Format
 from tcmrl_data.interchange.hdf5_file import Hdf5File, new_file, write_array

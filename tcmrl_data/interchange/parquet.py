@@ -33,10 +33,10 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import leaves
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.disk import named_errors
 from tcmrl_data.foundation.errors import StoreError
+from tcmrl_data.foundation.records import leaves
 from tcmrl_data.interchange.exporting import REMEDY, Format, transitions
 from tcmrl_data.interchange.reader import (
     EpisodeCuts,

@@ -20,11 +20,11 @@ import numpy.typing as npt
 from pydantic import BaseModel, ConfigDict
 
 from tcmrl_data.envs.base import Split
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import parse_json
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.errors import StoreError, TrajectoryError
-from tcmrl_data.foundation.plain_files import file_problem, one_line, printable
+from tcmrl_data.foundation.files import file_problem, one_line, printable
 from tcmrl_data.foundation.plugins import Registry
+from tcmrl_data.foundation.records import parse_json
 from tcmrl_data.store.part import ARRAY_NAME, STANDARD_ARRAYS
 from tcmrl_data.store.tables import MAX_INDEX
 

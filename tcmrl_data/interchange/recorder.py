@@ -12,10 +12,10 @@ import numpy.typing as npt
 from gymnasium.spaces import Box
 
 from tcmrl_data.envs.base import Split, Task
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import digest
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.disk import CHECKPOINTS, STAGING, remove_tree, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.foundation.records import digest
 from tcmrl_data.interchange.importing import recipe_of_episodes
 from tcmrl_data.interchange.reader import EpisodeCuts, episode_of
 from tcmrl_data.operations.assembly import derivation_of, open_assembly

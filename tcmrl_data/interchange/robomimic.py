@@ -28,7 +28,7 @@ import numpy as np
 
 from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.interchange.exporting import Format, episode_arrays
 from tcmrl_data.interchange.hdf5_file import Hdf5File, new_file, write_array

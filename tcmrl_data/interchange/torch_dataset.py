@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 from torch.utils.data import Dataset
 
-from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.interchange.exporting import episode_arrays
 from tcmrl_data.store.tables import PartKey
 

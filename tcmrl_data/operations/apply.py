@@ -13,7 +13,6 @@ from tcmrl_data.foundation.disk import LOCK, lock_file, remove_abandoned
 from tcmrl_data.foundation.errors import BuildError, NondeterminismError, SelectionError, StoreError
 from tcmrl_data.foundation.records import validate_table
 from tcmrl_data.operations.assembly import PlannedPart, append_parts, derivation_of, open_assembly
-from tcmrl_data.operations.derive import check_label
 from tcmrl_data.parts.jobs import DeriveSpec, Job, derive_parts
 from tcmrl_data.parts.operation import OPERATIONS
 from tcmrl_data.parts.own_operations import OWN_OPERATIONS, operation_of_run
@@ -31,33 +30,24 @@ def apply_operation(
     *,
     tasks: Sequence[int] | None = None,
     snapshots: str = "all",
-    of: str = MAIN_RUN,
-    run: str | None = None,
-    label: str | None = None,
     workers: int | None = None,
-    progress: Callable[[int, int], None] | None = None,
 ) -> Dataset:
-    """Makes a dataset whose parts an operation makes of the parts of another, each in its own task.
+    """Makes a dataset whose parts an operation makes of those of another's run `main`, each in its own task.
 
     The same call goes on after a stop. `verify_dataset` and `repair_dataset` make the parts again by the same
     operation, if they have the parts that these were made from: merge the two datasets for it.
 
     Args:
         path: a dataset or a view.
-        out: folder of the new dataset, which holds the new parts alone.
+        out: folder of the new dataset, which holds the new parts alone, in a run with the operation's name.
         operation: name of a plug-in of `tcmrl.operations`.
-        settings: of the operation.
         tasks: indices of the tasks whose parts are taken; all where None.
         snapshots: rule of `Dataset.select`.
-        of: run whose parts are taken.
-        run: name of the new run; that of the operation where None.
-        label: the new dataset's own name.
         workers: processes at the same time; one per core where None.
-        progress: called with parts done and parts in all.
 
     Raises:
         UnknownNameError: no installed package has the operation.
-        SelectionError: settings that the operation does not take, an unknown run, or nothing selected.
+        SelectionError: settings that the operation does not take, or nothing selected.
         BuildError: an operation that simulates, and parts whose seeds are not known, or a failed worker.
         NondeterminismError: an operation that simulates, and parts of another platform.
         StoreError: `out` holds something else, or a part is damaged.
@@ -70,47 +60,39 @@ def apply_operation(
     if operation in OWN_OPERATIONS:
         raise SelectionError(f"operation {operation} has a function of its own: derive, extend or relabel")
     kind = OPERATIONS.get(operation)
-    check_label(label)
-    keys = keys_of_run(dataset, of, tasks, snapshots)
+    keys = keys_of_run(dataset, MAIN_RUN, tasks, snapshots)
     common = dict(settings or {})
     example = kind.settings_for(common, dataset.task(keys[0].task))
     validate_table(kind.Settings, example, place=f"operation {operation}", error=SelectionError)
-    source = next(found for found in dataset.manifest.runs if found.name == of)
+    source = next(found for found in dataset.manifest.runs if found.name == MAIN_RUN)
     recipe = source.recipe or dataset.manifest.recipe
     if kind.simulates:
-        source, recipe, _ = simulated_run(dataset, of)
+        source, recipe, _ = simulated_run(dataset, MAIN_RUN)
         check_parts(dataset, source, keys, policy=False)
     foreign = source.kind in FOREIGN_KINDS
     template = Run(
-        name=run or operation,
+        name=operation,
         kind=source.kind if foreign else "derived",
         seed=source.seed,
         recipe=recipe,
-        origin=source.origin if foreign else {"operation": operation, "of": of, "settings": common},
+        origin=source.origin if foreign else {"operation": operation, "of": MAIN_RUN, "settings": common},
         steps=None,
     )
     tasks_of = sorted({key.task for key in keys})
-    names = {(task, task): template.name for task in tasks_of}
+    names = {(task, task): operation for task in tasks_of}
     recorded = {
         "operation": operation,
         "settings": common,
         "tasks": tasks_of,
         "snapshots": snapshots,
-        "of": of,
-        "run": template.name,
+        "of": MAIN_RUN,
+        "run": operation,
     }
     jobs = tuple(jobs_of_pairs(names, keys))
     spec = DeriveSpec(dataset.path_on_disk, Path(out), operation, common, recipe, source.seed, jobs)
-    make_of_parts(
-        dataset,
-        Path(out),
-        spec,
-        derivation=derivation_of("apply", recorded, [dataset]),
-        runs=runs_like(template, names),
-        label=label,
-        workers=workers,
-        progress=progress,
-    )
+    derivation = derivation_of("apply", recorded, [dataset])
+    runs = runs_like(template, names)
+    make_of_parts(dataset, Path(out), spec, derivation=derivation, runs=runs, workers=workers)
     return open_dataset(out)
 
 
@@ -124,20 +106,13 @@ def make_of_parts(
     with_old: bool = False,
     label: str | None = None,
     workers: int | None,
-    progress: Callable[[int, int], None] | None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> Manifest:
     """Makes a dataset of the parts that an operation makes of another's.
 
     Args:
-        dataset: whose parts are read.
-        out: folder of the new dataset.
-        spec: the parts to make.
         derivation: what is made; the same one goes on after a stop.
-        runs: of all parts.
         with_old: the new dataset has all parts of the other, too.
-        label: the new dataset's own name.
-        workers: processes at the same time; one per core where None.
-        progress: called with parts done and parts in all.
     """
     kept = {job.key.task for job in spec.jobs}
     with open_assembly(out, derivation, [dataset]) as assembly:
@@ -178,12 +153,7 @@ def add_parts(
 
 
 def simulated_run(dataset: Dataset, name: str) -> tuple[Run, Recipe, int]:
-    """A run whose parts have keyed seeds, its recipe and its root seed.
-
-    Raises:
-        SelectionError: the dataset has no such run.
-        BuildError: its parts cannot be simulated again.
-    """
+    """A run whose parts have keyed seeds, its recipe and its root seed."""
     known = {run.name: run for run in dataset.manifest.runs}
     if name not in known:
         raise SelectionError(f"{dataset.path} has no run {name!r}; it has {', '.join(sorted(known))}")
@@ -205,16 +175,8 @@ def check_parts(
 ) -> None:
     """Refuses parts that cannot be simulated here as they were.
 
-    Args:
-        dataset: that holds them.
-        run: theirs.
-        keys: theirs.
-        policy: whether their policies are needed.
-        allow_drift: whether another platform will do.
-
     Raises:
         BuildError: a part without policy, or with another seed than its run.
-        NondeterminismError: a part was made on another platform.
     """
     here = this_platform(dataset.environment, dataset.manifest.recipe.behavior.source)
     differences = [here.differences(platform) for platform in dataset.manifest.platforms]
@@ -232,11 +194,7 @@ def check_parts(
 
 
 def keys_of_run(dataset: Dataset, run: str, tasks: Sequence[int] | None, snapshots: str) -> list[PartKey]:
-    """The parts of a run that a selection leaves, sorted.
-
-    Raises:
-        SelectionError: nothing is left.
-    """
+    """The parts of a run that a selection leaves, sorted."""
     chosen = dataset.select(tasks=tasks, snapshots=snapshots)
     keys = sorted(key for keys in chosen.parts.values() for key in keys if key.run == run)
     if not keys:
@@ -253,11 +211,6 @@ def nearest_pairs(tasks: Sequence[Task], chosen: Sequence[Task], number: int) ->
 
     Tasks are compared by the Euclidean distance of their parameters, each in units of its standard deviation
     over all tasks; of tasks at equal distances the one with the smaller index is nearer.
-
-    Args:
-        tasks: all tasks.
-        chosen: where the pairs start.
-        number: of pairs per chosen task.
 
     Raises:
         SelectionError: parameters that are not numbers or not equally many, or too few tasks in a split.

@@ -10,7 +10,6 @@ from typing import Any
 from tcmrl_data.building.work_files import ASSEMBLY, check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.base import Split, Task
-from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
@@ -22,8 +21,8 @@ from tcmrl_data.foundation.disk import (
     sync_files,
 )
 from tcmrl_data.foundation.errors import BuildError, StoreError
-from tcmrl_data.foundation.plain_files import read_plain_file
-from tcmrl_data.foundation.records import sealed, write_ranges
+from tcmrl_data.foundation.files import read_plain_file
+from tcmrl_data.foundation.records import canonical_json, sealed, sha256, write_ranges
 from tcmrl_data.parts.making import Published, make_from, numbered, publish
 from tcmrl_data.parts.operation import Operation, StoredPart, can_be_made_again
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
@@ -59,9 +58,6 @@ class PlannedPart:
     """A part of the new dataset.
 
     Attributes:
-        key: in the new dataset.
-        source: where it comes from.
-        source_key: in the source.
         operation: makes the part of the other, without a simulator; None takes the part over as it is.
     """
 
@@ -76,12 +72,7 @@ class PlannedPart:
         return self.source.entry(self.source_key)
 
     def make(self) -> tuple[PartRecord, bytes]:
-        """The record and the archive of a part that is made anew.
-
-        Raises:
-            StoreError: the part of the source is damaged.
-            SelectionError: it has no such array, or no such episode.
-        """
+        """The record and the archive of a part that is made anew."""
         assert self.operation is not None
         source = StoredPart.of(self.source, self.source_key)
         return make_from(self.operation, source, task=self.source.task(self.source_key.task))
@@ -92,14 +83,8 @@ class Plan:
     """A new dataset before it is made.
 
     Attributes:
-        name: the environment's name.
-        data_version: of the parts.
         runs: how the parts were made, the first with a recipe.
-        tasks: with their splits.
-        parts: of the dataset.
         derivation: how it follows from its sources.
-        sources: the datasets that are read.
-        label: the dataset's own name.
     """
 
     name: str
@@ -132,7 +117,6 @@ def derivation_of(
     """What the manifest of a derived dataset says of how it was made.
 
     Args:
-        operation: such as `subset` or `merge`.
         settings: JSON values that the result follows from, together with the sources.
         sources: the datasets that it is made from.
         splits: of tasks whose split is not as the recipe draws it; None takes them over from the sources.
@@ -163,10 +147,6 @@ class Assembly:
         derivation: what is made; an assembly of another derivation is not continued.
         sources: datasets that are read; they must not change meanwhile.
 
-    Raises:
-        StoreError: the folder holds something else.
-        LockedError: another process writes to the folder.
-
     Example:
         >>> with open_assembly(out, derivation, [source]) as assembly:  # doctest: +SKIP
         ...     assembly.copy([PlannedPart(key, source, key) for key in source.parts])
@@ -187,13 +167,8 @@ class Assembly:
     ) -> None:
         """Copies whole parts; each is hashed on the way.
 
-        Args:
-            parts: the parts, none with an operation.
-            progress: called with parts done and parts in all.
-
         Raises:
             StoreError: a part of a source is missing or damaged; the message names it.
-            StorageError: the operating system refuses an operation.
         """
         make_folders(self._out / STAGING)
         for done, part in enumerate(parts, start=1):
@@ -204,12 +179,7 @@ class Assembly:
         self._copied += [self._out / part_file(part.key) for part in parts]
 
     def write(self, key: PartKey, make: Callable[[], tuple[PartRecord, bytes]]) -> PartEntry:
-        """Publishes a new part, unless an attempt that was stopped has done so.
-
-        Args:
-            key: the part's.
-            make: makes the part's record and archive.
-        """
+        """Publishes a new part, unless an attempt that was stopped has done so."""
         return self.take(publish(self._out, key, make))
 
     def take(self, published: Published) -> PartEntry:
@@ -226,13 +196,6 @@ class Assembly:
         label: str | None = None,
     ) -> Manifest:
         """Writes tables and manifest; the dataset exists from then on.
-
-        Args:
-            name: the environment's name.
-            data_version: of the parts.
-            runs: of the parts.
-            tasks: the dataset's tasks.
-            label: the dataset's own name.
 
         Raises:
             StoreError: a source has changed since it was opened, or no part is left.
@@ -260,7 +223,6 @@ class Assembly:
         return manifest
 
     def _copy(self, part: PlannedPart) -> PartEntry:
-        """Copies a part unless it is there; returns its line."""
         target, entry = self._out / part_file(part.key), part.entry
         if not _holds(target, entry):
             place_file(target, part.source.content(part.source_key), staging=self._out / STAGING)
@@ -297,12 +259,7 @@ def open_assembly(out: Path, derivation: Derivation, sources: Sequence[Dataset])
 
 
 def check_out(out: Path, derivation: Derivation) -> None:
-    """Refuses a folder that is neither new nor one where the same assembly was stopped.
-
-    Raises:
-        StoreError: it is not; the message names it.
-        BuildError: its work files are links.
-    """
+    """Refuses a folder that is neither new nor one where the same assembly was stopped."""
     if not out.exists():
         return
     if not out.is_dir():
@@ -328,14 +285,11 @@ def append_parts(dataset: Dataset, *, runs: Sequence[Run], parts: Sequence[Publi
     as it was, with files of parts that the same command finds again. The caller holds the dataset's lock.
 
     Args:
-        dataset: as it stands on disk.
         runs: all runs of the dataset from now on.
         parts: the new parts, whose files are in their places.
 
     Raises:
-        StoreError: the dataset has changed since it was opened.
         BuildError: more parts, runs or platforms than a dataset may have.
-        StorageError: the operating system refuses an operation.
     """
     manifest, folder = dataset.manifest, dataset.folder
     if read_manifest(folder).digest != manifest.digest:
@@ -371,8 +325,6 @@ def carry_out(plan: Plan, out: Path, progress: Progress | None = None) -> Manife
 
     Raises:
         StoreError: the folder holds something else, a part of a source is damaged, or a source has changed.
-        StorageError: the operating system refuses an operation.
-        LockedError: another process writes to the folder.
     """
     whole = [part for part in plan.parts if part.operation is None]
     with open_assembly(out, plan.derivation, plan.sources) as assembly:
@@ -405,8 +357,6 @@ def settle_runs(
 
     Args:
         runs: of the sources, under the names of the new dataset.
-        keys: of the new dataset's parts.
-        tasks: of the new dataset.
         cut: names of runs with parts that were made anew.
     """
     counts: dict[str, int] = {}

@@ -32,11 +32,8 @@ class ExtendReport:
     """What an extension did, or would do.
 
     Attributes:
-        dataset: where the new parts are.
-        runs: the runs that hold them.
         made: number of new parts; of parts that would be new after `dry_run`.
         present: parts that the dataset had already.
-        episodes: of every part.
         root: of the dataset; None after `dry_run`.
     """
 
@@ -161,11 +158,6 @@ def _check_numbers(dataset: Dataset, lanes: int, episodes: int, first: int, nois
 
 
 def _with_runs(dataset: Dataset, template: Run, names: Mapping[Pair, str]) -> list[Run]:
-    """The runs of the dataset with those of new parts.
-
-    Raises:
-        BuildError: a run of the same name was made in another way.
-    """
     runs = {run.name: run for run in dataset.manifest.runs}
     for new in runs_like(template, names):
         old = runs.get(new.name)

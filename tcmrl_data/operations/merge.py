@@ -8,8 +8,8 @@ from typing import Any
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.base import Split, Task
-from tcmrl_data.foundation.canonical import canonical_json, differences, digest
 from tcmrl_data.foundation.errors import SelectionError
+from tcmrl_data.foundation.records import canonical_json, differences, digest
 from tcmrl_data.operations.assembly import (
     Plan,
     PlannedPart,
@@ -163,7 +163,6 @@ def plan_merge(
         names: of each source's run `main` in the union; further runs get the name and their own. None, or no
             names at all, keep a run's name where it is free.
         split_from: digest of the source whose splits decide.
-        label: the union's own name.
 
     Raises:
         SelectionError: the sources disagree; the message names what, where, and both values.
@@ -198,7 +197,6 @@ def plan_merge(
 
 
 def _check(sources: Sequence[Dataset]) -> None:
-    """Refuses sources that are incomplete or of different environments."""
     first = sources[0]
     for source in sources:
         if not source.manifest.complete:
@@ -212,7 +210,6 @@ def _check(sources: Sequence[Dataset]) -> None:
 
 
 def _common(source: Dataset) -> dict[str, Any]:
-    """What all sources must have in common."""
     environment = source.manifest.recipe.environment.model_dump(mode="json")
     return {"environment": environment, "data_version": source.manifest.data_version}
 
@@ -247,7 +244,6 @@ def _tasks(sources: Sequence[Dataset], split_from: str | None) -> tuple[tuple[Ta
 
 
 def _merged(pairs: Sequence[tuple[Dataset, str | None]]) -> list[_MergedRun]:
-    """The runs of the union, in an order that follows from their contents."""
     members = []
     for source, asked in pairs:
         parts: dict[str, dict[tuple[int, int], PartEntry]] = {run.name: {} for run in source.manifest.runs}
@@ -282,7 +278,6 @@ def _rank(merged: _MergedRun) -> tuple[bool, bool, int, str, str, str]:
 
 
 def _named(merged: Sequence[_MergedRun]) -> dict[str, _MergedRun]:
-    """The runs of the union by name."""
     named: dict[str, _MergedRun] = {}
     for run in sorted(merged, key=lambda run: run.members[0].asked is None):
         name = run.members[0].asked
@@ -296,7 +291,6 @@ def _named(merged: Sequence[_MergedRun]) -> dict[str, _MergedRun]:
 
 
 def _candidates(merged: _MergedRun) -> Iterator[str]:
-    """Names of a run, the best first."""
     names = {member.run.name for member in merged.members}
     yield from sorted(names, key=lambda name: (name != MAIN_RUN, name))
     first = merged.members[0]

@@ -7,7 +7,6 @@ from pathlib import Path
 from tcmrl_data.building.work_files import ASSEMBLY, check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.base import Split
-from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
@@ -18,7 +17,8 @@ from tcmrl_data.foundation.disk import (
     sync_files,
 )
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.foundation.files import read_plain_file
+from tcmrl_data.foundation.records import sha256
 from tcmrl_data.operations.derive import derive_dataset
 from tcmrl_data.remote.address import parse_address
 from tcmrl_data.remote.files import counted

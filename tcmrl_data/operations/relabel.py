@@ -34,11 +34,7 @@ class RelabelReport:
     """What a relabelling made, or would make.
 
     Attributes:
-        dataset: the new dataset.
         runs: its runs; each holds one source per task.
-        pairs: number of pairs of tasks.
-        parts: number of parts.
-        steps: number of steps.
         root: of the dataset; None after `dry_run`.
     """
 
@@ -144,7 +140,6 @@ def relabel_dataset(
 
 
 def _sources(dataset: Dataset, tasks: Sequence[int] | None, allow_test: bool) -> list[Task]:
-    """The tasks whose episodes are taken."""
     if tasks is None:
         chosen = dataset.tasks if allow_test else dataset.train_tasks
     else:
@@ -156,7 +151,6 @@ def _sources(dataset: Dataset, tasks: Sequence[int] | None, allow_test: bool) ->
 def _pairs(
     dataset: Dataset, sources: Sequence[Task], to: str | Sequence[int], allow_test: bool
 ) -> list[Pair]:
-    """Which task's episodes get which task's rewards."""
     if isinstance(to, str):
         match = re.fullmatch(r"all|nearest:([1-9][0-9]{0,4})", to)
         if match is None:
@@ -190,11 +184,7 @@ def _refuse_test(tasks: Sequence[Task], allow_test: bool) -> None:
 
 
 def _try_out(dataset: Dataset, spec: DeriveSpec) -> None:
-    """Relabels the first episode that goes to every task, so that most refusals come before any work.
-
-    Raises:
-        SimulationError: tasks differ in more than rewards.
-    """
+    """Relabels the first episode that goes to every task, so that most refusals come before any work."""
     firsts = {job.key.task: job for job in reversed(spec.jobs)}
     for index, job in sorted(firsts.items()):
         assert spec.seed is not None

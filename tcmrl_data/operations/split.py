@@ -71,7 +71,9 @@ def split_dataset(
     else:
         plans = list(_plan_episodes(opened, tuple(episodes or ())))
     chosen = [str(number) for number in range(len(plans))] if names is None else list(names)
-    if len(set(chosen)) != len(plans) or not all(map(_is_name, chosen)):
+    if len(set(chosen)) != len(plans) or any(
+        name in ("", ".", "..") or Path(name).name != name for name in chosen
+    ):
         raise SelectionError(f"--names {','.join(chosen)}: expected {len(plans)} different names of folders")
     targets = [Path(out) / (f"{name}.json" if views else name) for name in chosen]
     waiting = [pair for pair in zip(plans, targets, strict=True) if not _is_made(*pair)]
@@ -136,16 +138,7 @@ def _tested(source: Dataset, *, folds: int, seed: int, fold: int) -> set[int]:
 
 
 def plan_episodes(source: Dataset, *, first: int, number: int) -> Plan:
-    """The dataset of some consecutive episodes of every part.
-
-    Args:
-        source: a dataset.
-        first: position of the first episode.
-        number: of episodes.
-
-    Raises:
-        SelectionError: a part has fewer episodes.
-    """
+    """The dataset of some consecutive episodes of every part."""
     parts = []
     for entry in source.parts.entries():
         if first + number > entry.episodes:
@@ -175,10 +168,6 @@ def _plan_episodes(source: Dataset, numbers: tuple[int, ...]) -> Iterator[Plan]:
 
 def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
     return None if progress is None else lambda done, _: progress(before + done, total)
-
-
-def _is_name(name: str) -> bool:
-    return name not in ("", ".", "..") and Path(name).name == name
 
 
 def _is_made(plan: Plan, target: Path) -> bool:

@@ -10,11 +10,10 @@ from typing import Any
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.engine.base import ENGINES, Unit
-from tcmrl_data.engine.worker import Send
-from tcmrl_data.foundation.canonical import digest
+from tcmrl_data.engine.local import Send
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.foundation.records import as_model
+from tcmrl_data.foundation.records import as_model, digest, from_json, to_json
 from tcmrl_data.parts.making import NO_REFERENCES, Published, make_from, one_thread, publish, wanted_from
 from tcmrl_data.parts.operation import Operation, Simulator, StoredPart
 from tcmrl_data.parts.own_operations import operation_named
@@ -30,12 +29,7 @@ UNITS_PER_WORKER = 4
 
 @dataclass(frozen=True)
 class Job:
-    """A part that is to be made from another one.
-
-    Attributes:
-        source: the other part.
-        key: of the new part.
-    """
+    """A part that is to be made from another one."""
 
     source: PartKey
     key: PartKey
@@ -43,16 +37,13 @@ class Job:
 
 @dataclass(frozen=True)
 class DeriveSpec:
-    """What a worker is told; JSON both ways.
+    """What a worker is told, as JSON.
 
     Attributes:
         source: folder of the dataset that is read.
         out: folder where parts are published; may be the same one.
-        operation: name of the operation.
         settings: what the settings of all its parts have in common.
-        recipe: that simulated parts go by.
         seed: root seed of the parts that are read, and of the new ones; None where it is not known.
-        jobs: the parts to make.
     """
 
     source: Path
@@ -62,31 +53,6 @@ class DeriveSpec:
     recipe: Recipe
     seed: int | None
     jobs: tuple[Job, ...]
-
-    def to_json(self) -> dict[str, Any]:
-        """JSON form."""
-        return {
-            "source": str(self.source.resolve()),
-            "out": str(self.out.resolve()),
-            "operation": self.operation,
-            "settings": dict(self.settings),
-            "recipe": self.recipe.model_dump(mode="json"),
-            "seed": self.seed,
-            "jobs": [[list(job.source), list(job.key)] for job in self.jobs],
-        }
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> "DeriveSpec":
-        """The inverse of `to_json`."""
-        return cls(
-            Path(values["source"]),
-            Path(values["out"]),
-            values["operation"],
-            values["settings"],
-            as_model(Recipe, values["recipe"]),
-            values["seed"],
-            tuple(Job(PartKey(*source), PartKey(*key)) for source, key in values["jobs"]),
-        )
 
     def operation_on(self, dataset: Dataset, source: PartKey) -> Operation[Any]:
         """The operation with the settings of the part that is made from `source`."""
@@ -102,9 +68,9 @@ class DeriveSpec:
         for start in range(0, len(tasks), size):
             chosen = set(tasks[start : start + size])
             jobs = tuple(job for job in self.jobs if job.key.task in chosen)
-            spec = dataclasses.replace(self, jobs=jobs)
+            spec = dataclasses.replace(self, source=self.source.resolve(), out=self.out.resolve(), jobs=jobs)
             name = f"tasks {min(chosen)} to {max(chosen)}"
-            units.append(Unit(name, spec.to_json(), WORKER, cost=float(len(jobs))))
+            units.append(Unit(name, to_json(spec), WORKER, cost=float(len(jobs))))
         return units
 
 
@@ -112,11 +78,6 @@ def derive_parts(
     spec: DeriveSpec, *, workers: int | None, progress: Callable[[int, int], None] | None = None
 ) -> list[Published]:
     """Makes and publishes the parts of all jobs; parts that are there already are read and left alone.
-
-    Args:
-        spec: what to make.
-        workers: processes at the same time; one per core where None.
-        progress: called with parts done and parts in all.
 
     Returns:
         The parts, sorted by key.
@@ -149,15 +110,8 @@ def derive_parts(
 def publish_jobs(spec: DeriveSpec, report: Send) -> str:
     """Makes every missing part of the jobs, those of a task with one simulator.
 
-    Args:
-        spec: what to make.
-        report: receives a message per part.
-
     Returns:
         A digest over the ids of the parts.
-
-    Raises:
-        StoreError: another part lies where one is to be.
     """
     dataset = open_dataset(spec.source)
     ids = []
@@ -197,4 +151,4 @@ def references_of(dataset: Dataset, task: int) -> References:
 def work(values: dict[str, Any], report: Send) -> str:
     """Makes and publishes the parts of some jobs; the digest of their ids."""
     with one_thread():
-        return publish_jobs(DeriveSpec.from_json(values), report)
+        return publish_jobs(from_json(DeriveSpec, values), report)

@@ -10,11 +10,10 @@ from typing import Any
 import numpy as np
 
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import canonical_json, digest
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError, StoreError
-from tcmrl_data.foundation.records import as_model
+from tcmrl_data.foundation.records import as_model, canonical_json, digest
 from tcmrl_data.parts.operation import Operation, Simulator, Sources, StoredPart, WantedPart
 from tcmrl_data.recipe.recipe import same_settings
 from tcmrl_data.store.archive import Archive, pack_archive
@@ -55,9 +54,7 @@ def make_part(
     Args:
         wanted: the part's identity but for its arrays.
         episodes: at least one.
-        references: of the task.
         behavior: what the behavior source records with its parts.
-        platform: on which the episodes were made.
     """
     arrays = pack(episodes)
     snapshot, derived = wanted.snapshot, wanted.derived
@@ -121,9 +118,6 @@ def wanted_from(
     """The identity of the part that an operation makes of a stored one.
 
     Args:
-        operation: with its settings.
-        source: the stored part.
-        task: of the new part.
         simulator: of that task, for an operation that simulates: the new part goes by its recipe.
     """
     identity = source.record.identity
@@ -155,9 +149,6 @@ def make_from(
     """The record and the archive of the part that an operation makes of a stored one.
 
     Args:
-        operation: with its settings.
-        source: the stored part.
-        task: of the new part.
         simulator: of that task, for an operation that simulates.
         references: of that task; parts that are not simulated keep those of the stored one.
     """
@@ -177,7 +168,6 @@ class Published:
 
     Attributes:
         entry: its line of the table, but for `platform`, which only the driver knows.
-        platform: on which it was made.
     """
 
     entry: PartEntry
@@ -201,12 +191,7 @@ class Published:
 
 
 def read_published(file: Path, run: str) -> tuple[Published, PartRecord]:
-    """Reads a whole part that nobody has described yet, and its record.
-
-    Raises:
-        StoreError: it is damaged.
-        ManifestError: its record is.
-    """
+    """Reads a whole part that nobody has described yet, and its record."""
     with Archive(file) as archive:
         record = read_part_record(archive)
         check_members(archive, record)
@@ -224,13 +209,7 @@ def publish(
     """Publishes a part; a sound one that is there is left alone, and a damaged one made again.
 
     Args:
-        folder: of the dataset.
-        key: of the part.
-        make: makes its record and archive.
         wanted: what a part that is there must be; any will do where None.
-
-    Raises:
-        StoreError: another part lies there.
     """
     file = folder / part_file(key)
     if file.exists():

@@ -18,7 +18,7 @@ from pydantic import BaseModel
 
 from tcmrl_data.behavior.base import Snapshot, read_snapshot
 from tcmrl_data.envs.base import Environment, Lanes, Task
-from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.errors import BuildError, RenderingError, StoreError, TrajectoryError
 from tcmrl_data.foundation.plugins import Registry
 from tcmrl_data.recipe.recipe import Recipe
@@ -40,7 +40,6 @@ class WantedPart:
 
     Attributes:
         settings: the unit settings of the run's recipe.
-        step: snapshot step.
         seed: root seed of the run; None where it is not known.
         snapshot: the policy; None where it is not known.
         derived: how the part is made from others: `operation`, `from` (ids of parts) and `settings`.
@@ -61,9 +60,7 @@ class StoredPart:
     """A part that lies in a dataset or an archive; its arrays are read when they are asked for.
 
     Attributes:
-        record: of the part.
         place: its file, for messages.
-        read: returns arrays by their names.
         snapshot: the policy; None where it is not known.
         first: number of the first episodes that are read; all where None.
     """
@@ -85,8 +82,13 @@ class StoredPart:
         dataset.content(key)
         record = dataset.part(*key)
         snapshot = None if record.identity.policy is None else dataset.snapshot(*key)
-        read = functools.partial(_read_of, dataset, key)
-        return cls(record, str(dataset.file_of(key)), read, snapshot, dataset.task(key.task))
+        return cls(
+            record,
+            str(dataset.file_of(key)),
+            lambda names: dataset.arrays(*key, names=names),
+            snapshot,
+            dataset.task(key.task),
+        )
 
     @classmethod
     def in_archive(cls, archive: Archive, record: PartRecord) -> "StoredPart":
@@ -114,21 +116,14 @@ class StoredPart:
         return dataclasses.replace(self, first=number)
 
 
-def _read_of(dataset: "Dataset", key: PartKey, names: Iterable[str]) -> Mapping[str, npt.NDArray[Any]]:
-    return dataset.arrays(*key, names=names)
-
-
 @final
 class Simulator:
     """The simulator of one task; its lanes are made when they are first used.
 
     Args:
         recipe: says how many episodes and lanes a part has.
-        seed: root seed of the episodes.
-        task: in which policies act.
         environment: the recipe's, where it is made already.
         platform: of this process for the recipe, where it is known already.
-        num_lanes: instead of the recipe's.
     """
 
     def __init__(
@@ -207,9 +202,6 @@ class Operation(abc.ABC, Generic[OperationSettings]):
     Equal identities and sources give equal episodes, bit for bit: random numbers come from
     `foundation.seeding.keyed_generator`, keyed by the wanted part's seed, task and step.
 
-    Args:
-        settings: an instance of `Settings`.
-
     Example:
         >>> class EverySecond(Operation[Record]):
         ...     name = "every-second"
@@ -228,8 +220,8 @@ class Operation(abc.ABC, Generic[OperationSettings]):
     """Whether the episodes come from the simulator. The parts of operations that do not simulate keep seed,
     platform and reference returns of the part that they are made from."""
     keeps: ClassVar[tuple[str, ...]] = ()
-    """Arrays that a part has in common with the one that it is made from. With observations and actions
-    among them, a part can be made again from itself, where the other one is not at hand."""
+    """Names of the arrays that the operation copies unchanged from its source. If it copies observations and
+    actions, `verify` makes a part whose source is missing again from the part itself."""
     own_seeds: ClassVar[bool] = False
     """Whether episodes are reset with keyed seeds of the part's own task, so that further ones can follow."""
     example: ClassVar[Mapping[str, Any]] = {}
@@ -261,7 +253,6 @@ class Operation(abc.ABC, Generic[OperationSettings]):
         """What the settings of a run's parts have in common, as the manifest says.
 
         Args:
-            run: of the parts.
             source: of the parts that they are made from.
         """
         settings: Mapping[str, Any] = (run.origin or {}).get("settings", {})
@@ -276,9 +267,7 @@ class Operation(abc.ABC, Generic[OperationSettings]):
         """The task and the number in the key of the seed with which an episode was reset.
 
         Args:
-            task: of the part.
             number: position of the episode in the part.
-            run: of the part.
 
         Raises:
             RenderingError: the operation does not say.
@@ -306,11 +295,7 @@ def can_be_made_again(run: Run) -> bool:
 
 
 def check_finite(trajectories: Sequence[Trajectory], place: str) -> None:
-    """Refuses episodes with values that are not finite.
-
-    Raises:
-        BuildError: names the episode, the array and the step.
-    """
+    """Refuses episodes with values that are not finite."""
     for episode, trajectory in enumerate(trajectories):
         for name in ("rewards", "observations", "actions"):
             array = getattr(trajectory, name)

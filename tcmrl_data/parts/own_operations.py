@@ -9,14 +9,14 @@ from pydantic import Field, ValidationError
 
 from tcmrl_data.behavior.base import Snapshot
 from tcmrl_data.envs.base import Task
-from tcmrl_data.envs.controller import (
+from tcmrl_data.envs.rollout import (
     Controller,
     NoisyController,
     PlaybackController,
     Trajectory,
     UniformController,
+    roll_out,
 )
-from tcmrl_data.envs.rollout import roll_out
 from tcmrl_data.foundation.errors import BuildError, ManifestError, SelectionError, SimulationError
 from tcmrl_data.foundation.records import (
     Record,
@@ -134,7 +134,6 @@ def act(
     """The recipe's episodes of one policy, in lane batches; every episode has its own keyed seeds.
 
     Args:
-        snapshot: the policy.
         simulator: of the task in which it acts.
         parameters: of the task that the policy was made for.
         first_episode: number of the first episode; a multiple of the lanes, so that batches are the same.
@@ -335,11 +334,7 @@ class Cut(Operation[CutSettings]):
         return None if episodes is None else read_ranges(episodes, limit=MAX_COUNT)
 
     def episodes(self, wanted: WantedPart, sources: Sources) -> list[Trajectory]:
-        """The kept episodes of the other part.
-
-        Raises:
-            SelectionError: it has no such array, or no such episode.
-        """
+        """The kept episodes of the other part."""
         part, without = sources.part, self.settings.without
         names = set(part.record.identity.arrays)
         for name in without:
@@ -415,11 +410,7 @@ class Import(Operation[Record]):
         super().__init__(settings or Record())
 
     def episodes(self, wanted: WantedPart, sources: Sources) -> list[Trajectory]:
-        """Raises.
-
-        Raises:
-            BuildError: always; imported parts come from the importer.
-        """
+        """Raises."""
         raise BuildError("its seed or its policy is not known")
 
 
@@ -430,12 +421,7 @@ OWN_OPERATIONS: Mapping[str, type[Operation[Any]]] = {
 
 
 def operation_named(name: str) -> type[Operation[Any]]:
-    """The operation of a name, of this package or of another.
-
-    Raises:
-        UnknownNameError: no installed package declares it.
-        PluginError: the package that declares it is broken.
-    """
+    """The operation of a name, of this package or of another."""
     return OWN_OPERATIONS.get(name) or OPERATIONS.get(name)
 
 
@@ -448,13 +434,8 @@ def operation_of_run(run: Run) -> type[Operation[Any]]:
 def operation_of(identity: Identity, place: str) -> Operation[Any]:
     """The operation that makes a part.
 
-    Args:
-        identity: of the part.
-        place: of the part, for messages.
-
     Raises:
         ManifestError: its settings are not valid; names the place and the field.
-        UnknownNameError: no installed package has the operation.
     """
     derived = identity.derived
     if derived is None:

@@ -16,30 +16,11 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.base import Split, Task
-from tcmrl_data.envs.controller import FloatArray
+from tcmrl_data.envs.rollout import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import evenly_spread
-from tcmrl_data.quality.measured import (
-    COLORS,
-    SMALLEST_STD,
-    TQ_LABEL,
-    Measured,
-    MeasuredPart,
-    MeasuredStage,
-    MeasuredTask,
-    PartSteps,
-    by_stage,
-    draw_matrix,
-    filled_parts,
-    heading,
-    label_axes,
-    new_figure,
-    sampled_parts,
-    save_figure,
-    steps_by_task,
-    title,
-)
+from tcmrl_data.quality import measured
 from tcmrl_data.quality.scores import trajectory_quality
 from tcmrl_data.store.tables import PartKey
 
@@ -55,7 +36,7 @@ Cells = npt.NDArray[Any]
 """Distinct cells, sorted; one opaque item each."""
 
 
-class SnapshotCoverage(MeasuredPart):
+class SnapshotCoverage(measured.MeasuredPart):
     """The coverage of a part.
 
     Attributes:
@@ -70,14 +51,14 @@ class SnapshotCoverage(MeasuredPart):
     tq: float | None
 
 
-class TaskCoverage(MeasuredTask):
+class TaskCoverage(measured.MeasuredTask):
     """The coverage of a task's parts; `cells` counts those of all parts together."""
 
     cells: int
     snapshots: tuple[SnapshotCoverage, ...]
 
 
-class StageCoverage(MeasuredStage):
+class StageCoverage(measured.MeasuredStage):
     """Means over a stage's parts."""
 
     parts: int
@@ -99,7 +80,7 @@ class Overlap(Record):
     shares: tuple[tuple[float, ...], ...]
 
 
-class Coverage(Measured):
+class Coverage(measured.Measured):
     """State-action coverage of all parts: the document of `inspect coverage --json`.
 
     Attributes:
@@ -143,11 +124,11 @@ def measure_coverage(
     """
     if not 0 < cell < np.inf:
         raise SelectionError(f"--cell {cell} is not a positive number of standard deviations")
-    grid = _grid(sampled_parts(dataset), cell)
-    tasks = list(dict.fromkeys(key.task for key in filled_parts(dataset)))
+    grid = _grid(measured.sampled_parts(dataset), cell)
+    tasks = list(dict.fromkeys(key.task for key in measured.filled_parts(dataset)))
     compared = evenly_spread(tasks, overlap_tasks)
     rows, visited = [], dict[int, Cells]()
-    for task, parts in steps_by_task(dataset, progress):
+    for task, parts in measured.steps_by_task(dataset, progress):
         pairs, states = dict[PartKey, Cells](), grid.no_states
         for key, steps in parts:
             pairs[key] = grid.pairs(steps)
@@ -156,9 +137,9 @@ def measure_coverage(
         rows.append(_task_coverage(dataset, task, pairs))
         if task.index in compared:
             visited[task.index] = states
-    stages = by_stage((task.split, row) for task in rows for row in task.snapshots)
+    stages = measured.by_stage((task.split, row) for task in rows for row in task.snapshots)
     return Coverage(
-        **heading(dataset),
+        **measured.heading(dataset),
         cell=cell,
         columns=grid.columns,
         stages=tuple(_stage(*stage) for stage in stages),
@@ -186,18 +167,18 @@ class Grid:
         """No state cells."""
         return _distinct(np.empty((0, len(self.observation_columns))))
 
-    def states(self, steps: PartSteps) -> Cells:
+    def states(self, steps: measured.PartSteps) -> Cells:
         """Distinct cells of observations."""
         return _distinct(steps.observations[:, self.observation_columns] / self.observation_widths)
 
-    def pairs(self, steps: PartSteps) -> Cells:
+    def pairs(self, steps: measured.PartSteps) -> Cells:
         """Distinct cells of observations with actions."""
         observations = steps.observations[:, self.observation_columns] / self.observation_widths
         actions = steps.actions[:, self.action_columns] / self.action_widths
         return _distinct(np.concatenate([observations, actions], axis=1))
 
 
-def _grid(sample: Iterable[PartSteps], cell: float) -> Grid:
+def _grid(sample: Iterable[measured.PartSteps], cell: float) -> Grid:
     """A grid from the standard deviations of all columns over a sample of parts."""
     found: dict[str, list[FloatArray]] = {"observations": [], "actions": []}
     counts = []
@@ -212,7 +193,7 @@ def _grid(sample: Iterable[PartSteps], cell: float) -> Grid:
         mean = np.average(means, axis=0, weights=counts)
         variance = np.average(variances + (means - mean) ** 2, axis=0, weights=counts)
         std = np.sqrt(variance)
-        columns[name] = np.flatnonzero(std > SMALLEST_STD)
+        columns[name] = np.flatnonzero(std > measured.SMALLEST_STD)
         widths[name] = cell * std[columns[name]]
     return Grid(widths["observations"], widths["actions"], columns["observations"], columns["actions"])
 
@@ -268,9 +249,9 @@ def _overlap(visited: dict[int, Cells]) -> Overlap:
 
 def plot_coverage(found: Coverage, file: Path) -> None:
     """Draws coverage against trajectory quality, a line per split along the steps, and overlaps of tasks."""
-    figure = new_figure(10.0, 4.4)
+    figure = measured.new_figure(10.0, 4.4)
     left, right = figure.subplots(1, 2)
-    for split, color in COLORS.items():
+    for split, color in measured.COLORS.items():
         parts = [row for task in found.tasks if task.split == split for row in task.snapshots]
         known = [(row.saco, row.tq) for row in parts if row.tq is not None]
         if known:
@@ -281,8 +262,10 @@ def plot_coverage(found: Coverage, file: Path) -> None:
         for stage in stages[:: max(1, len(stages) - 1)] if split == "train" else ():
             place = (stage.saco, stage.tq or 0.0)
             left.annotate(f"step {stage.step:,}", place, (6, 6), textcoords="offset points", fontsize="small")
-    label_axes(left, title(found), "state-action coverage (share of the task's cells)", TQ_LABEL)
+    measured.label_axes(
+        left, measured.title(found), "state-action coverage (share of the task's cells)", measured.TQ_LABEL
+    )
     left.legend(fontsize="small")
-    draw_matrix(right, found.overlap.shares, found.overlap.tasks, "share of states visited too")
+    measured.draw_matrix(right, found.overlap.shares, found.overlap.tasks, "share of states visited too")
     right.set(title="states that tasks share", xlabel="task", ylabel="task")
-    save_figure(figure, file)
+    measured.save_figure(figure, file)

@@ -13,7 +13,7 @@ import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.base import Split, Task
-from tcmrl_data.envs.controller import FloatArray
+from tcmrl_data.envs.rollout import FloatArray
 from tcmrl_data.foundation.errors import SelectionError, StoreError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import evenly_spread
@@ -42,7 +42,6 @@ class Measured(Record):
 
     Attributes:
         label: the dataset's own name, if it has one.
-        environment: the environment's name.
         root: of the dataset; equal data have an equal root.
     """
 
@@ -97,7 +96,6 @@ class PartSteps:
     Attributes:
         observations: (steps, observation_dim), before the step.
         actions: (steps, action_dim).
-        rewards: (steps,).
         next_observations: (steps, observation_dim), after the step.
         lengths: number of steps of every episode.
     """
@@ -134,11 +132,7 @@ def read_steps(dataset: Dataset, key: PartKey) -> PartSteps:
 
 
 def filled_parts(dataset: Dataset) -> list[PartKey]:
-    """The keys of all parts that have steps, ascending.
-
-    Raises:
-        SelectionError: there is none.
-    """
+    """The keys of all parts that have steps, ascending."""
     table = dataset.parts
     keys = [key for key, steps in zip(table, table.columns["steps"], strict=True) if steps]
     if not keys:
@@ -219,10 +213,6 @@ def new_figure(width: float, height: float) -> "Figure":
 
 
 def save_figure(figure: "Figure", file: Path) -> None:
-    """Writes a figure; the ending of the name is its format.
-
-    Raises:
-        SelectionError: as `check_picture` does.
-    """
+    """Writes a figure; the ending of the name is its format."""
     check_picture(file)
     figure.savefig(file, dpi=DOTS_PER_INCH)

@@ -9,25 +9,9 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.envs.base import Split
-from tcmrl_data.envs.controller import FloatArray
+from tcmrl_data.envs.rollout import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
-from tcmrl_data.quality.measured import (
-    COLORS,
-    STEPS_LABEL,
-    Measured,
-    MeasuredPart,
-    MeasuredStage,
-    MeasuredTask,
-    PartSteps,
-    by_stage,
-    heading,
-    label_axes,
-    new_figure,
-    sampled_parts,
-    save_figure,
-    steps_by_task,
-    title,
-)
+from tcmrl_data.quality import measured
 from tcmrl_data.store.tables import PartKey
 
 BINS = 40
@@ -36,7 +20,7 @@ BINS = 40
 Counts = npt.NDArray[np.int64]
 
 
-class SnapshotRewards(MeasuredPart):
+class SnapshotRewards(measured.MeasuredPart):
     """The stored rewards of a part.
 
     Attributes:
@@ -54,13 +38,13 @@ class SnapshotRewards(MeasuredPart):
     max: float
 
 
-class TaskRewards(MeasuredTask):
+class TaskRewards(measured.MeasuredTask):
     """The rewards of a task's parts."""
 
     snapshots: tuple[SnapshotRewards, ...]
 
 
-class StageRewards(MeasuredStage):
+class StageRewards(measured.MeasuredStage):
     """The rewards of a stage; `zero`, `silent`, `mean` are means over its parts."""
 
     parts: int
@@ -73,7 +57,7 @@ class StageRewards(MeasuredStage):
     counts: tuple[int, ...]
 
 
-class Rewards(Measured):
+class Rewards(measured.Measured):
     """Stored rewards of all parts: the document of `inspect rewards --json`.
 
     Attributes:
@@ -102,9 +86,9 @@ def measure_rewards(
     """
     if bins < 1:
         raise SelectionError(f"--bins {bins} is not a positive number")
-    edges = _edges([steps.rewards for steps in sampled_parts(dataset)], bins)
+    edges = _edges([steps.rewards for steps in measured.sampled_parts(dataset)], bins)
     counts, rows = dict[tuple[int, Split], Counts](), []
-    for task, parts in steps_by_task(dataset, progress):
+    for task, parts in measured.steps_by_task(dataset, progress):
         snapshots = []
         for key, steps in parts:
             snapshots.append(_snapshot(key, steps))
@@ -112,9 +96,9 @@ def measure_rewards(
             found = np.histogram(inside, edges)[0].astype(np.int64)
             counts[key.step, task.split] = counts.get((key.step, task.split), 0) + found
         rows.append(TaskRewards(task=task.index, split=task.split, snapshots=tuple(snapshots)))
-    stages = by_stage((task.split, row) for task in rows for row in task.snapshots)
+    stages = measured.by_stage((task.split, row) for task in rows for row in task.snapshots)
     return Rewards(
-        **heading(dataset),
+        **measured.heading(dataset),
         edges=tuple(edges.tolist()),
         stages=tuple(_stage(step, split, members, counts[step, split]) for step, split, members in stages),
         tasks=tuple(rows),
@@ -129,7 +113,7 @@ def _edges(samples: list[FloatArray], bins: int) -> FloatArray:
     return np.linspace(low, high, bins + 1)
 
 
-def _snapshot(key: PartKey, steps: PartSteps) -> SnapshotRewards:
+def _snapshot(key: PartKey, steps: measured.PartSteps) -> SnapshotRewards:
     rewards = steps.rewards
     ends = np.cumsum(steps.lengths)[:-1]
     silent = [not episode.any() for episode in np.split(rewards, ends)]
@@ -163,7 +147,7 @@ def _stage(step: int, split: Split, rows: Sequence[SnapshotRewards], counts: Cou
 
 def plot_rewards(found: Rewards, file: Path) -> None:
     """Draws the distribution of rewards by step, training tasks, and the share of zero rewards."""
-    figure = new_figure(10.0, 4.4)
+    figure = measured.new_figure(10.0, 4.4)
     left, right = figure.subplots(1, 2)
     stages = [stage for stage in found.stages if stage.split == "train"] or list(found.stages)
     shares = [[count / max(1, sum(stage.counts)) for count in stage.counts] for stage in stages]
@@ -177,9 +161,13 @@ def plot_rewards(found: Rewards, file: Path) -> None:
     left.set_xticks(
         range(len(stages)), [f"{stage.step:,}" for stage in stages], rotation=60, fontsize="small"
     )
-    left.set(title=f"{title(found)}: rewards, {stages[0].split} tasks", xlabel=STEPS_LABEL, ylabel="reward")
+    left.set(
+        title=f"{measured.title(found)}: rewards, {stages[0].split} tasks",
+        xlabel=measured.STEPS_LABEL,
+        ylabel="reward",
+    )
     left.figure.colorbar(image, ax=left, label="share of steps in a bin")
-    for split, color in COLORS.items():
+    for split, color in measured.COLORS.items():
         rows = [stage for stage in found.stages if stage.split == split]
         steps = [stage.step for stage in rows]
         right.plot(steps, [stage.zero for stage in rows], "o-", color=color, label=f"{split}, zero rewards")
@@ -191,6 +179,6 @@ def plot_rewards(found: Rewards, file: Path) -> None:
             label=f"{split}, episodes without reward",
         )
     right.set_ylim(-0.03, 1.03)
-    label_axes(right, "how often there is no reward", STEPS_LABEL, "share")
+    measured.label_axes(right, "how often there is no reward", measured.STEPS_LABEL, "share")
     right.legend(fontsize="small")
-    save_figure(figure, file)
+    measured.save_figure(figure, file)

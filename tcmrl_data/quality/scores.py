@@ -13,22 +13,7 @@ from tcmrl_data.dataset.selection import TIERS, Tier, task_scores, tier_parts
 from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.records import Record
-from tcmrl_data.quality.measured import (
-    COLORS,
-    STEPS_LABEL,
-    TQ_LABEL,
-    Measured,
-    MeasuredPart,
-    MeasuredStage,
-    MeasuredTask,
-    by_stage,
-    check_picture,
-    heading,
-    label_axes,
-    new_figure,
-    save_figure,
-    title,
-)
+from tcmrl_data.quality import measured
 from tcmrl_data.store.tables import PartKey
 
 if TYPE_CHECKING:
@@ -48,7 +33,6 @@ class Spread(Record):
     Attributes:
         iqm: interquartile mean, without the lowest and the highest quarter.
         low: lower end of the 95% bootstrap interval of `iqm`; None with fewer than five values.
-        high: upper end.
     """
 
     mean: float
@@ -59,7 +43,7 @@ class Spread(Record):
     max: float
 
 
-class SnapshotQuality(MeasuredPart):
+class SnapshotQuality(measured.MeasuredPart):
     """The quality of a part.
 
     Attributes:
@@ -73,20 +57,20 @@ class SnapshotQuality(MeasuredPart):
     tiers: tuple[Tier, ...]
 
 
-class TaskQuality(MeasuredTask):
+class TaskQuality(measured.MeasuredTask):
     """The quality of a task's parts."""
 
     snapshots: tuple[SnapshotQuality, ...]
 
 
-class StageQuality(MeasuredStage):
+class StageQuality(measured.MeasuredStage):
     """The quality of a stage's parts, whose number is `parts`; `tq` is None where a part has none."""
 
     parts: int
     tq: Spread | None
 
 
-class Quality(Measured):
+class Quality(measured.Measured):
     """Trajectory quality and tiers of all parts: the document of `inspect quality --json`."""
 
     stages: tuple[StageQuality, ...]
@@ -105,8 +89,8 @@ def measure_quality(dataset: Dataset) -> Quality:
         0.9
     """
     tasks = tuple(_task_quality(dataset, task) for task in dataset.tasks)
-    rows = by_stage((task.split, row) for task in tasks for row in task.snapshots)
-    return Quality(**heading(dataset), stages=tuple(_stage(*stage) for stage in rows), tasks=tasks)
+    rows = measured.by_stage((task.split, row) for task in tasks for row in task.snapshots)
+    return Quality(**measured.heading(dataset), stages=tuple(_stage(*stage) for stage in rows), tasks=tasks)
 
 
 def trajectory_quality(dataset: Dataset, task: int) -> dict[PartKey, float]:
@@ -189,48 +173,46 @@ def spread(values: Sequence[float]) -> Spread:
 
 def plot_quality(found: Quality, file: Path) -> None:
     """Draws trajectory quality by step: a thin line per task, and the interquartile mean of each split."""
-    figure = new_figure(7.0, 4.2)
+    figure = measured.new_figure(7.0, 4.2)
     axes = figure.subplots()
     for task in found.tasks:
         points = [(row.step, row.tq) for row in task.snapshots if row.tq is not None]
         steps, values = zip(*points, strict=True) if points else ((), ())
-        axes.plot(steps, values, color=COLORS[task.split], alpha=0.3, linewidth=0.8)
-    for split in COLORS:
+        axes.plot(steps, values, color=measured.COLORS[task.split], alpha=0.3, linewidth=0.8)
+    for split in measured.COLORS:
         _draw_split(axes, found, split)
     for level in (0.0, 1.0):
         axes.axhline(level, color="0.3", linestyle=":", linewidth=0.9)
-    label_axes(axes, title(found), STEPS_LABEL, TQ_LABEL)
+    measured.label_axes(axes, measured.title(found), measured.STEPS_LABEL, measured.TQ_LABEL)
     axes.legend(fontsize="small")
-    save_figure(figure, file)
+    measured.save_figure(figure, file)
 
 
 def _draw_split(axes: "Axes", found: Quality, split: Split) -> None:
-    """The interquartile means of a split, with their interval where it is known."""
     stages = [(stage.step, stage.tq) for stage in found.stages if stage.split == split and stage.tq]
     if not stages:
         return
     steps, spreads = zip(*stages, strict=True)
     label = f"{split}, interquartile mean and 95%"
-    axes.plot(steps, [tq.iqm for tq in spreads], "o-", color=COLORS[split], label=label)
+    axes.plot(steps, [tq.iqm for tq in spreads], "o-", color=measured.COLORS[split], label=label)
     if all(tq.low is not None for tq in spreads):
         ends = ([tq.low for tq in spreads], [tq.high for tq in spreads])
-        axes.fill_between(steps, *ends, color=COLORS[split], alpha=0.25, linewidth=0)
+        axes.fill_between(steps, *ends, color=measured.COLORS[split], alpha=0.25, linewidth=0)
 
 
 def plot_returns(dataset: Dataset, table: dict[str, Any], file: Path) -> None:
     """Draws the learning curves of all tasks, train and test apart, with oracle and uniform actions.
 
     Args:
-        table: what `list_returns` made.
         file: the picture to write; its ending names the format.
 
     Raises:
         SelectionError: the file's name is none of a picture, or the dataset has no parts.
     """
-    check_picture(file)
+    measured.check_picture(file)
     if not any(task["snapshots"] for task in table["tasks"]):
         raise SelectionError(f"{dataset.folder} has no parts to plot; build it with `tcmrl-data build`")
-    figure = new_figure(7.0, 4.2)
+    figure = measured.new_figure(7.0, 4.2)
     axes = figure.subplots()
     for split, color in zip(SPLITS, ("tab:blue", "tab:orange"), strict=True):
         _draw_returns(axes, table, split, color)
@@ -239,7 +221,7 @@ def plot_returns(dataset: Dataset, table: dict[str, Any], file: Path) -> None:
     axes.set_title(f"{dataset.name}: behavior policies of {len(table['tasks'])} tasks")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
-    save_figure(figure, file)
+    measured.save_figure(figure, file)
 
 
 def _draw_returns(axes: "Axes", table: dict[str, Any], split: str, color: str) -> None:

@@ -10,21 +10,19 @@ from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.listing import SPLITS
 from tcmrl_data.dataset.selection import chosen_parts
 from tcmrl_data.envs.base import Environment, Split, Task, in_order
-from tcmrl_data.envs.controller import BelievingController, Controller, DeterministicController, FloatArray
-from tcmrl_data.envs.rollout import first_observation, hidden_entries, roll_out
+from tcmrl_data.envs.rollout import (
+    BelievingController,
+    Controller,
+    DeterministicController,
+    FloatArray,
+    first_observation,
+    hidden_entries,
+    roll_out,
+)
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.seeding import Purpose, evenly_spread, keyed_generator, keyed_seed
 from tcmrl_data.parts.making import one_thread
-from tcmrl_data.quality.measured import (
-    TQ_LABEL,
-    Measured,
-    MeasuredTask,
-    draw_matrix,
-    heading,
-    new_figure,
-    save_figure,
-    title,
-)
+from tcmrl_data.quality import measured
 from tcmrl_data.store.tables import MAIN_RUN, PartKey
 
 EPISODES = 5
@@ -40,7 +38,7 @@ Policy = Callable[[int], Controller]
 """Takes a number of lanes and gives a controller for one rollout in them."""
 
 
-class TransferTask(MeasuredTask):
+class TransferTask(measured.MeasuredTask):
     """A row and a column of the matrix: a task and its last policy.
 
     Attributes:
@@ -55,7 +53,7 @@ class TransferTask(MeasuredTask):
     best: float
 
 
-class Transfer(Measured):
+class Transfer(measured.Measured):
     """Every last policy in every task: the document of `inspect transfer --json`.
 
     Attributes:
@@ -105,7 +103,8 @@ def measure_transfer(
         >>> measure_transfer(open_dataset("data/point-robot"), tasks=10).returns  # doctest: +SKIP
     """
     environment = dataset.environment
-    chosen = _chosen_tasks(dataset, _most_tasks(environment) if tasks is None else tasks)
+    most = MOST_SIMULATED_TASKS if environment.simulator_bytes else MOST_TASKS
+    chosen = _chosen_tasks(dataset, most if tasks is None else tasks)
     if episodes < 1:
         raise SelectionError(f"--episodes {episodes} is not a positive number")
     keys = [last_part(dataset, task) for task in chosen]
@@ -117,7 +116,7 @@ def measure_transfer(
         returns = _play(environment, chosen, policies, episodes=episodes, seed=seed, progress=progress)
     columns = [_transfer_task(dataset, task, key) for task, key in zip(chosen, keys, strict=True)]
     return Transfer(
-        **heading(dataset),
+        **measured.heading(dataset),
         seed=seed,
         episodes=episodes,
         deterministic=deterministic,
@@ -131,17 +130,10 @@ def measure_transfer(
     )
 
 
-def _most_tasks(environment: Environment) -> int:
-    return MOST_SIMULATED_TASKS if environment.simulator_bytes else MOST_TASKS
-
-
 def _chosen_tasks(dataset: Dataset, number: int) -> list[Task]:
     """At most `number` complete tasks, training tasks first, evenly spread along the environment's ordering.
 
     Both splits keep their share of the tasks, and at least one task each.
-
-    Raises:
-        SelectionError: fewer than two tasks, or no training task.
     """
     complete = [task for task in dataset.tasks if not dataset.missing(task.index)]
     complete = [task for task in complete if dataset.parts.keys_of(task.index)]
@@ -237,16 +229,16 @@ def _score(value: float, task: TransferTask) -> float | None:
 
 def plot_transfer(found: Transfer, file: Path) -> None:
     """Draws the matrix of scores, or of returns where a task has no references; a line parts the splits."""
-    figure = new_figure(6.4, 5.4)
+    figure = measured.new_figure(6.4, 5.4)
     axes = figure.subplots()
     scored = all(score is not None for row in found.scores for score in row)
     rows = [[score or 0.0 for score in row] for row in found.scores] if scored else found.returns
-    label = TQ_LABEL if scored else "mean undiscounted return"
-    draw_matrix(axes, rows, [task.task for task in found.tasks], label)
+    label = measured.TQ_LABEL if scored else "mean undiscounted return"
+    measured.draw_matrix(axes, rows, [task.task for task in found.tasks], label)
     border = sum(task.split == "train" for task in found.tasks) - 0.5
     if border < len(found.tasks) - 1:
         axes.axhline(border, color="white", linewidth=1.2)
         axes.axvline(border, color="white", linewidth=1.2)
     axes.set(xlabel="task acted in (test tasks last)", ylabel="task of the policy")
-    axes.set_title(f"{title(found)}: last policies in all tasks")
-    save_figure(figure, file)
+    axes.set_title(f"{measured.title(found)}: last policies in all tasks")
+    measured.save_figure(figure, file)

@@ -26,25 +26,11 @@ import numpy.typing as npt
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.listing import SPLITS
 from tcmrl_data.envs.base import Split
-from tcmrl_data.envs.controller import FloatArray
+from tcmrl_data.envs.rollout import FloatArray
 from tcmrl_data.foundation.errors import SelectionError
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import NO_TASK, Purpose, keyed_generator
-from tcmrl_data.quality.measured import (
-    COLORS,
-    SMALLEST_STD,
-    STEPS_LABEL,
-    Measured,
-    MeasuredStage,
-    PartSteps,
-    by_stage,
-    heading,
-    label_axes,
-    new_figure,
-    read_steps,
-    save_figure,
-    title,
-)
+from tcmrl_data.quality import measured
 from tcmrl_data.quality.scores import bootstrap_interval
 from tcmrl_data.quality.transfer import EPISODES, Transfer, TransferTask, measure_transfer
 
@@ -70,7 +56,6 @@ class SplitWorth(Record):
         best: mean of the best returns that are known of the tasks.
         worth: (own − single) / (best − uniform).
         low: lower end of the 95% bootstrap interval of `worth` over tasks; None with fewer than five.
-        high: upper end.
     """
 
     split: Split
@@ -84,7 +69,7 @@ class SplitWorth(Record):
     high: float | None
 
 
-class StageVisibility(MeasuredStage):
+class StageVisibility(measured.MeasuredStage):
     """How visible the task is in the data of a stage.
 
     Attributes:
@@ -100,7 +85,7 @@ class StageVisibility(MeasuredStage):
     dynamics: float | None
 
 
-class Worth(Measured):
+class Worth(measured.Measured):
     """Whether a context is worth having: the document of `inspect worth --json`.
 
     Attributes:
@@ -165,7 +150,7 @@ def measure_worth(
     )
     single, splits = context_worth(transfer)
     return Worth(
-        **heading(dataset),
+        **measured.heading(dataset),
         seed=seed,
         episodes=episodes,
         transitions=transitions,
@@ -265,22 +250,17 @@ def measure_visibility(
     Parts with fewer than two episodes are left out. Samples of the parts of one step are in memory.
 
     Args:
-        tasks: the tasks; `measure_transfer` gives them.
         transitions: most transitions of a part that are predicted, and most that predict.
-        progress: called with parts done and parts in all.
-
-    Raises:
-        StoreError: a part is damaged.
     """
     keys = [
         (task.split, key) for task in tasks for key in dataset.parts.keys_of(task.task) if key.run == task.run
     ]
     done = 0
-    for step, split, members in by_stage(keys):
+    for step, split, members in measured.by_stage(keys):
         samples = []
         for key in members:
             generator = keyed_generator(seed, dataset.name, key.task, Purpose.VISIBILITY, step)
-            sample = draw_sample(read_steps(dataset, key), transitions, generator)
+            sample = draw_sample(measured.read_steps(dataset, key), transitions, generator)
             samples += [sample] if sample is not None else []
             done += 1
             if progress:
@@ -298,7 +278,7 @@ def measure_visibility(
             )
 
 
-def draw_sample(steps: PartSteps, most: int, generator: np.random.Generator) -> Sample | None:
+def draw_sample(steps: measured.PartSteps, most: int, generator: np.random.Generator) -> Sample | None:
     """At most `most` transitions of even episodes, which predict, and of odd ones; None if one is empty."""
     odd = np.repeat(np.arange(len(steps.lengths)) % 2 == 1, steps.lengths)
     halves = []
@@ -324,9 +304,6 @@ def visibility(
     E_same sums the squared errors of predictions from the same task, E_other those from as many transitions
     of the other tasks; changes are summed over columns, in standard deviations. None with fewer than two
     tasks, and where the other tasks predict without error.
-
-    Args:
-        generator: draws the transitions of other tasks.
     """
     if len(samples) < 2:
         return None, None
@@ -354,7 +331,7 @@ def visibility(
 def _scale(values: FloatArray) -> FloatArray:
     """One over the standard deviation of every column; 0 for columns that do not vary."""
     std = values.std(axis=0)
-    varies = std > SMALLEST_STD * np.maximum(1.0, np.abs(values).max(axis=0))
+    varies = std > measured.SMALLEST_STD * np.maximum(1.0, np.abs(values).max(axis=0))
     scale: FloatArray = np.where(varies, 1.0 / np.where(varies, std, 1.0), 0.0)
     return scale
 
@@ -376,10 +353,10 @@ def _squared_errors(known: Half, asked: Half) -> tuple[float, float]:
 
 def plot_worth(found: Worth, file: Path) -> None:
     """Draws returns of the best single and of own policies within their range, and visibility by step."""
-    figure = new_figure(10.0, 4.4)
+    figure = measured.new_figure(10.0, 4.4)
     left, right = figure.subplots(1, 2)
     _draw_returns(left, found)
-    for split, color in COLORS.items():
+    for split, color in measured.COLORS.items():
         stages = [stage for stage in found.stages if stage.split == split]
         for name, line in (("reward", "o-"), ("dynamics", "s--")):
             points = [
@@ -389,10 +366,12 @@ def plot_worth(found: Worth, file: Path) -> None:
                 label = f"{split}, in {'rewards' if name == 'reward' else name}"
                 right.plot(*zip(*points, strict=True), line, color=color, label=label, markersize=4)
     right.axhline(0.0, color="0.3", linestyle=":", linewidth=0.9)
-    label_axes(right, "visibility of the task", STEPS_LABEL, "visibility (0 invisible, 1 plain to see)")
+    measured.label_axes(
+        right, "visibility of the task", measured.STEPS_LABEL, "visibility (0 invisible, 1 plain to see)"
+    )
     if found.stages:
         right.legend(fontsize="small")
-    save_figure(figure, file)
+    measured.save_figure(figure, file)
 
 
 def _draw_returns(axes: "Axes", found: Worth) -> None:
@@ -401,10 +380,10 @@ def _draw_returns(axes: "Axes", found: Worth) -> None:
         if row.uniform is not None:
             axes.bar(place, row.best - row.uniform, 0.5, bottom=row.uniform, color="0.88", zorder=1)
         gain = row.own - row.single
-        axes.bar(place, gain, 0.5, bottom=row.single, color=COLORS[row.split], alpha=0.7, zorder=2)
+        axes.bar(place, gain, 0.5, bottom=row.single, color=measured.COLORS[row.split], alpha=0.7, zorder=2)
         worth = "" if row.worth is None else f"worth {row.worth:.0%}"
         axes.text(place + 0.28, (row.own + row.single) / 2, worth, va="center", fontsize="small")
     axes.set_xlim(-0.5, len(found.splits))
-    label_axes(axes, title(found), "", "mean undiscounted return")
+    measured.label_axes(axes, measured.title(found), "", "mean undiscounted return")
     axes.set_xticks(range(len(found.splits)), [f"{row.split} ({row.tasks} tasks)" for row in found.splits])
     axes.set_xlabel("colored: from the best single policy to own policies\ngrey: from uniform to best known")

@@ -162,9 +162,7 @@ class RecipeDocument:
     """The content of a recipe file, for one environment.
 
     Attributes:
-        environment: the environment's name.
         place: the document's name in error messages.
-        text: the file's text.
         content: the file's tables, including variants and profiles.
     """
 
@@ -217,7 +215,6 @@ def open_recipe(name_or_file: str | Path) -> RecipeDocument:
             or a class in a file of yours, such as `my_env.py:MyEnv`, whose recipe stands beside it.
 
     Raises:
-        UnknownNameError: no such environment.
         PluginError: the file of yours cannot be imported, or holds no such environment.
         RecipeError: the file does not exist or is not a recipe.
     """
@@ -235,7 +232,6 @@ def open_recipe(name_or_file: str | Path) -> RecipeDocument:
 
 
 def _open_file(file: Path) -> RecipeDocument:
-    """A recipe file, which names its environment itself."""
     try:
         text = file.read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -293,11 +289,7 @@ def apply_overrides(table: Mapping[str, Any], overrides: Sequence[str]) -> dict[
 
 
 def read_override(text: str) -> tuple[list[str], Any]:
-    """The keys and the value of a text `section.key=value`.
-
-    Raises:
-        RecipeError: the text has another form.
-    """
+    """The keys and the value of a text `section.key=value`."""
     path, equals, value = text.partition("=")
     keys = path.strip().split(".")
     if not equals or len(keys) < 2 or not all(keys):

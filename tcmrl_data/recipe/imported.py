@@ -61,11 +61,7 @@ def foreign_recipe(
 
 
 def bound_recipe(environment: str, *, licence: str | None) -> Recipe:
-    """The recipe of imported data of an installed environment; `licence` is None if it is unknown.
-
-    Raises:
-        UnknownNameError: there is no such environment.
-    """
+    """The recipe of imported data of an installed environment; `licence` is None if it is unknown."""
     recipe = load_recipe(environment)
     return recipe.model_copy(
         update={

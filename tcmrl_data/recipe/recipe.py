@@ -20,7 +20,7 @@ from tcmrl_data.envs.base import (
     in_order,
     make_environment,
 )
-from tcmrl_data.envs.controller import ObservationView
+from tcmrl_data.envs.rollout import ObservationView
 from tcmrl_data.foundation.errors import RecipeError, TaskError, TcmrlError
 from tcmrl_data.foundation.records import as_model, missing_fields, validate_table
 from tcmrl_data.recipe import Profile
@@ -224,7 +224,6 @@ def full_settings(recorded: Mapping[str, Any]) -> dict[str, Any]:
     must give the same data as before.
 
     Raises:
-        UnknownNameError: the environment or behavior source is not installed.
         RecipeError: a key is unknown to this version, or a value is invalid.
     """
     validated = functools.partial(validate_table, place="recorded settings", error=RecipeError)
@@ -285,9 +284,6 @@ def spread(tasks: Sequence[Task], *, num_train: int, num_test: int, is_circular:
 
     Tasks are given in the order in which they are spaced. A selection contains the first and the last task of
     a split, so that it covers the same range; on a circle, where these are neighbors, only the first.
-
-    Raises:
-        TaskError: a split has fewer tasks.
     """
     chosen: list[int] = []
     for split, number in (("train", num_train), ("test", num_test)):

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES
 from tcmrl_data.envs.base import ENVIRONMENTS
-from tcmrl_data.foundation.canonical import leaves
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.foundation.plugins import one_line_error
+from tcmrl_data.foundation.records import leaves
 from tcmrl_data.recipe import Profile
 from tcmrl_data.recipe.document import RecipeDocument, open_recipe, read_override
 from tcmrl_data.recipe.recipe import Recipe, load_recipe

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Self, TypeGuard
 
 from tcmrl_data.foundation.errors import RemoteError
-from tcmrl_data.foundation.plain_files import printable
+from tcmrl_data.foundation.files import printable
 
 PROTOCOLS = ("s3", "gs", "az", "http", "https", "hf")
 WEB = ("http", "https", "hf")

@@ -16,7 +16,6 @@ import uuid
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
-from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.disk import (
     STAGING,
     disk,
@@ -28,8 +27,9 @@ from tcmrl_data.foundation.disk import (
     write_file,
 )
 from tcmrl_data.foundation.errors import ManifestError, RemoteError
+from tcmrl_data.foundation.files import read_plain_file
 from tcmrl_data.foundation.machine import cache_folder, cache_limit
-from tcmrl_data.foundation.plain_files import read_plain_file
+from tcmrl_data.foundation.records import sha256
 from tcmrl_data.remote.address import Address
 from tcmrl_data.remote.objects import Objects, each
 from tcmrl_data.remote.published import read_published

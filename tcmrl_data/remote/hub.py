@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from tcmrl_data.foundation.errors import MissingPackageError, RemoteError
-from tcmrl_data.foundation.plain_files import one_line, printable
+from tcmrl_data.foundation.files import one_line, printable
 from tcmrl_data.remote.address import Address
 from tcmrl_data.remote.files import Progress, counted
 from tcmrl_data.remote.local import LocalDataset, PushReport, batches

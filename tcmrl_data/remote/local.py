@@ -4,9 +4,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, sha256
 from tcmrl_data.foundation.errors import ManifestError, StoreError
-from tcmrl_data.foundation.plain_files import one_line, read_plain_file
+from tcmrl_data.foundation.files import one_line, read_plain_file
+from tcmrl_data.foundation.records import MAX_JSON_BYTES, sha256
 from tcmrl_data.recipe.imported import UNKNOWN
 from tcmrl_data.store.manifest import MANIFEST, Manifest, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, parse_parts

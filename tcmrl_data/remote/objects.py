@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 from zlib import crc32
 
 from tcmrl_data.foundation.errors import MissingPackageError, RemoteError
-from tcmrl_data.foundation.plain_files import one_line, printable
+from tcmrl_data.foundation.files import one_line, printable
 from tcmrl_data.remote.address import WEB, Address
 
 REQUESTS = 16

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 
 from pydantic import Field
 
-from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.errors import ManifestError, RemoteError
-from tcmrl_data.foundation.plain_files import one_line
-from tcmrl_data.foundation.records import Record, parse_record
+from tcmrl_data.foundation.files import one_line
+from tcmrl_data.foundation.records import MAX_JSON_BYTES, Record, parse_json, parse_record
 from tcmrl_data.remote.address import TAG_NAME, WEB, Address, parse_address
 from tcmrl_data.remote.objects import MissingObjectError, Objects, Version
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_SCHEMA, Manifest

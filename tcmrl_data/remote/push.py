@@ -11,9 +11,8 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
-from tcmrl_data.foundation.canonical import sha256
 from tcmrl_data.foundation.errors import RemoteError
-from tcmrl_data.foundation.records import record_bytes
+from tcmrl_data.foundation.records import record_bytes, sha256
 from tcmrl_data.remote.address import parse_address
 from tcmrl_data.remote.files import Progress, counted
 from tcmrl_data.remote.hub import push_to_hub

@@ -29,7 +29,6 @@ from typing import TYPE_CHECKING, BinaryIO
 import numpy as np
 from pydantic import ValidationError
 
-from tcmrl_data.foundation.canonical import digest
 from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
@@ -41,10 +40,9 @@ from tcmrl_data.foundation.disk import (
     remove_tree,
 )
 from tcmrl_data.foundation.errors import CacheError, LockedError, StorageError
-from tcmrl_data.foundation.locks import is_locked, take_shared_lock, try_exclusive_lock
+from tcmrl_data.foundation.files import is_locked, one_line, printable, take_shared_lock, try_exclusive_lock
 from tcmrl_data.foundation.machine import available_cores, cache_folder, cache_limit, size
-from tcmrl_data.foundation.plain_files import one_line, printable
-from tcmrl_data.foundation.records import Record, record_bytes
+from tcmrl_data.foundation.records import Record, digest, record_bytes
 from tcmrl_data.sampling.rows import (
     READERS,
     PackedRows,
@@ -121,7 +119,6 @@ def cached_rows(
 
     Raises:
         CacheError: the cache has no room, or its folder cannot be written.
-        SelectionError: a part has no dense rewards.
         StoreError: arrays cannot be decoded, do not form episodes, or are not those that the part's record
             names; the message names the part.
     """
@@ -239,7 +236,6 @@ def _write_entry(folder: Path, entry: Path, selection: "Selection", dense: bool)
 
 
 def _read_record(file: BinaryIO) -> EntryRecord | None:
-    """An entry's record; None if it is damaged, or of another format."""
     try:
         return EntryRecord.model_validate_json(os.pread(file.fileno(), RECORD_BYTES, 0))
     except ValidationError:
@@ -250,7 +246,6 @@ def _problem(file: BinaryIO, *, limit: int | None = None) -> str | None:
     """Why an entry is damaged, in words; None if nothing is found.
 
     Args:
-        file: the entry, opened.
         limit: a file above this size, in bytes, is not hashed; None hashes every file.
     """
     record = _read_record(file)
@@ -344,7 +339,6 @@ def _make_room(folder: Path, needed: int) -> None:
 
 
 def _remove(entry: Path) -> bool:
-    """Removes an entry unless a process reads it."""
     with contextlib.suppress(FileNotFoundError), entry.open("r+b") as file:
         if not try_exclusive_lock(file) or not is_current(file, entry):
             return False
@@ -373,11 +367,7 @@ def _writer_lock(folder: Path, say: Callable[[str], None] | None) -> Iterator[No
 
 @contextlib.contextmanager
 def _named_cache(folder: Path) -> Iterator[None]:
-    """Turns errors of file operations into an error that says how to move the cache.
-
-    Raises:
-        CacheError: the operating system refuses a file operation within the block.
-    """
+    """Turns errors of file operations into an error that says how to move the cache."""
     try:
         yield
     except (OSError, StorageError) as error:

@@ -18,7 +18,6 @@ class Transitions:
     """Single transitions, drawn uniformly from all transitions of a task, with replacement.
 
     Attributes:
-        number: transitions per task.
         returns: whether steps include returns to go, discounts, final observations and times.
         rewards: `dense` takes the array `dense_rewards` as the steps' rewards, which environments with sparse
             rewards may store beside them. The same transitions are drawn.
@@ -63,7 +62,6 @@ class Windows:
     """Consecutive transitions of one episode, drawn uniformly from all windows of a task, with replacement.
 
     Attributes:
-        number: windows per task.
         length: transitions per window.
         returns: as for `Transitions`.
     """
@@ -343,7 +341,6 @@ def read_end(filled: Indices, counts: Indices, number: int, *, from_back: bool) 
     Args:
         filled: the result of `fill_places`, with at least `places_filled(number)` places or with all places.
         counts: (...) number of episodes of every order, at least `number`.
-        number: number of episodes to read.
         from_back: reads from the back if True, from the front otherwise.
     """
     inwards = np.arange(number).reshape(number, *[1] * counts.ndim)

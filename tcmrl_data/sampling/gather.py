@@ -111,7 +111,6 @@ class Endings:
     """Returns to go of packed rows; the other values are computed from the positions of episodes.
 
     Attributes:
-        rows: the packed selection.
         returns_to_go: (rows,) discounted sum of rewards from a step to the end of its episode; 0 for rows
             that are not steps.
         discounts: (longest episode + 1,) powers of gamma, from gamma^0.
@@ -202,7 +201,6 @@ class Gatherer:
     rows (row i is the block that starts at row i), one index selects a transition, window or trajectory.
 
     Args:
-        rows: the packed selection.
         table: the table of the rows, in host memory or on the device.
         endings: by rewards, for the kinds that are requested with `returns=True`.
     """
@@ -256,7 +254,6 @@ class Gatherer:
         return Batch(torch.from_numpy(self._rows.task_indices[draw.tasks]), steps)
 
     def _gather(self, memory: Tensor, block: _Block, rows: Indices) -> Tensor | None:
-        """Copies a kind into the buffer; returns its mask, or None if nothing is padding."""
         floats = block.view.shape[1]
         out = memory[block.offset : block.offset + rows.size * floats].view(rows.size, floats)
         if rows.size:
@@ -266,7 +263,6 @@ class Gatherer:
         return self._clear_padding(out, rows) if is_padded else None
 
     def _clear_padding(self, out: Tensor, rows: Indices) -> Tensor:
-        """Sets padding to zero; returns the mask (tasks, number, longest episode)."""
         episodes = self._rows.episodes
         drawn = np.searchsorted(episodes.starts, rows)
         lengths = torch.from_numpy(episodes.lengths[drawn]).to(out.device)[..., None]

@@ -159,7 +159,6 @@ def fill_table(table: Table, plan: Sequence[PartRows], *, check_digests: bool = 
     """Reads parts into a table of zeros, several at a time; returns the lengths of all episodes.
 
     Args:
-        table: of the shape that `table_shape` gives.
         check_digests: compare the decoded arrays with the digests of the parts' records; for rows that others
             receive under the parts' ids.
 

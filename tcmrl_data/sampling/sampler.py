@@ -98,9 +98,6 @@ def load_rows(
     """The rows of a selection in memory, or mapped from the cache if they exceed the limit.
 
     Arguments as of `open_sampler`; `dense` loads dense rewards too.
-
-    Raises:
-        TcmrlError: as `read_rows` or `cached_rows` does.
     """
     rows, width = table_shape(selection, plan_rows(selection, dense=dense))
     needed = 4 * rows * width
@@ -128,7 +125,6 @@ class Sampler:
     otherwise batches are gathered in page-locked memory and copied asynchronously.
 
     Args:
-        rows: the packed selection.
         environment: the environment's name, part of the seed's key.
         place: name of the selection in error messages.
 

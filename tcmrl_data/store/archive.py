@@ -17,7 +17,7 @@ from typing import Self
 from zlib import crc32
 
 from tcmrl_data.foundation.errors import StoreError, UnreadableError
-from tcmrl_data.foundation.plain_files import one_line, open_plain_file, printable
+from tcmrl_data.foundation.files import one_line, open_plain_file, printable
 
 LARGEST_ARCHIVE = 2**31
 """Bytes of an archive; with `MOST_MEMBERS` below what would need the ZIP64 extension."""
@@ -69,8 +69,6 @@ class Archive:
     """An opened archive; contents are checked as they are read. Threads may read side by side.
 
     Attributes:
-        path: the file.
-        size: its bytes.
         sizes: name to bytes of every member, in the order of the file.
 
     Example:
@@ -83,11 +81,6 @@ class Archive:
     """
 
     def __init__(self, path: Path) -> None:
-        """Opens an archive.
-
-        Raises:
-            StoreError: the file is missing, no plain file, or no ZIP of members as they are written here.
-        """
         self.path = path
         try:
             self._file = open_plain_file(path, limit=LARGEST_ARCHIVE)
@@ -130,11 +123,7 @@ class Archive:
         """The content of a member, checked against its checksum.
 
         Args:
-            name: the member.
             limit: maximum size in bytes; None for what the archive holds, at most `LARGEST_ARCHIVE`.
-
-        Raises:
-            StoreError: no such member, larger than the limit, or damaged.
         """
         content = self.read_unchecked(name, limit=limit)
         if crc32(content) != self._members[name].CRC:
@@ -171,30 +160,17 @@ class Archive:
             raise StoreError(f"{self.path} is not written as archives are here{REPAIR}")
 
     def content(self) -> bytes:
-        """The whole file.
-
-        Raises:
-            StoreError: it cannot be read.
-        """
+        """The whole file."""
         return self._read_range(0, self.size)
 
     def sha256(self) -> str:
-        """The sha256 of the whole file, in hexadecimal; takes little memory.
-
-        Raises:
-            StoreError: it cannot be read.
-        """
+        """The sha256 of the whole file, in hexadecimal; takes little memory."""
         digest = hashlib.sha256()
         for offset in range(0, self.size, _HASHED_BYTES):
             digest.update(self._read_range(offset, min(_HASHED_BYTES, self.size - offset)))
         return digest.hexdigest()
 
     def _read_directory(self) -> dict[str, zipfile.ZipInfo]:
-        """All members by name.
-
-        Raises:
-            StoreError: there is no directory, or one of members that are not written here.
-        """
         self._read_range(max(0, self.size - _END), _END)  # what the system refuses is no damage
         try:
             with zipfile.ZipFile(self._file) as archive:

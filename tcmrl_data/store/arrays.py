@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from tcmrl_data.envs.controller import Trajectory
-from tcmrl_data.foundation.canonical import differences, parse_json, sha256
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.plain_files import one_line
+from tcmrl_data.foundation.files import one_line
+from tcmrl_data.foundation.records import differences, parse_json, sha256
 from tcmrl_data.store.archive import Archive
 
 METADATA_BYTES = 2**16
@@ -110,11 +110,7 @@ def check_layout(archive: Archive, arrays: Mapping[str, Mapping[str, Any]]) -> l
     """Checks a part's `zarr.json` files against what is written here and the part's own record.
 
     Args:
-        archive: the part.
         arrays: name to `{"dtype", "shape", …}`, as the part's record has them.
-
-    Raises:
-        StoreError: names the file and the field.
     """
     with _named_metadata(archive, f"{ARRAYS}/zarr.json") as data:
         _check_equal({"attributes": {}} | _parse_table(data), _GROUP)
@@ -152,11 +148,7 @@ def _named_metadata(archive: Archive, file: str) -> Iterator[bytes]:
 
 
 def check_expansion(layouts: Iterable[ArrayLayout], stored_bytes: int, place: object) -> None:
-    """Refuses arrays that would decode to more than their size on disk justifies.
-
-    Raises:
-        StoreError: names the place.
-    """
+    """Refuses arrays that would decode to more than their size on disk justifies."""
     decoded = sum(layout.decoded_bytes for layout in layouts)
     if decoded > max(DECODED_FLOOR, DECODED_RATIO * stored_bytes):
         raise StoreError(
@@ -284,11 +276,7 @@ def unpack(arrays: Arrays) -> list[Trajectory]:
 
 
 def checked_offsets(offsets: npt.NDArray[np.int64], steps: int) -> npt.NDArray[np.int64]:
-    """The offsets of a part's episodes, if they rise from 0 to its number of steps.
-
-    Raises:
-        StoreError: they do not.
-    """
+    """The offsets of a part's episodes, if they rise from 0 to its number of steps."""
     if (
         len(offsets) < 1
         or offsets[0] != 0

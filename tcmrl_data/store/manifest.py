@@ -13,11 +13,18 @@ from typing import Annotated, Any, Literal
 from pydantic import FailFast, Field, field_validator, model_validator
 
 from tcmrl_data.envs.base import Split, Task
-from tcmrl_data.foundation.canonical import MAX_JSON_BYTES, parse_json
 from tcmrl_data.foundation.disk import STAGING, replace_file
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.plain_files import one_line, read_plain_file, words_after
-from tcmrl_data.foundation.records import Kind, Record, parse_record, read_ranges, sealed
+from tcmrl_data.foundation.files import one_line, read_plain_file, words_after
+from tcmrl_data.foundation.records import (
+    MAX_JSON_BYTES,
+    Kind,
+    Record,
+    parse_json,
+    parse_record,
+    read_ranges,
+    sealed,
+)
 from tcmrl_data.recipe import Profile
 from tcmrl_data.recipe.document import AND, joined_licences
 from tcmrl_data.recipe.recipe import Recipe
@@ -273,11 +280,7 @@ def read_manifest(path: Path) -> Manifest:
 
 
 def write_manifest(folder: Path, data: bytes) -> None:
-    """Replaces the manifest of a dataset, which is another one from then on, and then the copy of it.
-
-    Raises:
-        StorageError: the operating system refuses an operation.
-    """
+    """Replaces the manifest of a dataset, which is another one from then on, and then the copy of it."""
     for name in (MANIFEST, MANIFEST_COPY):
         replace_file(folder / name, data, staging=folder / STAGING)
 
@@ -366,9 +369,6 @@ def write_dataset(
     """Writes the tables and then the manifest that seals them; the dataset exists from then on.
 
     The fields are those of `Manifest`; `tasks` and `table` hold those of dropped tasks too.
-
-    Raises:
-        StorageError: the operating system refuses an operation.
     """
     tables = {
         TASKS: b"".join(task_line(task) for task in sorted(tasks, key=lambda task: task.index)),

@@ -14,11 +14,10 @@ from pydantic import Field, field_validator
 
 from tcmrl_data.behavior.base import BEHAVIOR_SOURCES
 from tcmrl_data.envs.base import ENVIRONMENTS, Environment
-from tcmrl_data.foundation.canonical import digest, parse_json
 from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.foundation.files import one_line, printable
 from tcmrl_data.foundation.machine import processor
-from tcmrl_data.foundation.plain_files import one_line, printable
-from tcmrl_data.foundation.records import Record, parse_record
+from tcmrl_data.foundation.records import Record, digest, parse_json, parse_record
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import ARRAYS, ArrayLayout, check_expansion, check_layout
 from tcmrl_data.store.tables import MAX_ARRAYS, MAX_COUNT, MAX_INDEX, PART_RECORD_BYTES, SHA256
@@ -95,7 +94,6 @@ def this_platform(environment: Environment, behavior: str | None = None) -> Plat
     Making the environment's fingerprint loads a simulator, so a process should call this once.
 
     Args:
-        environment: the environment of the rollouts.
         behavior: name of the behavior source; its package counts too.
     """
     return Platform(
@@ -105,7 +103,6 @@ def this_platform(environment: Environment, behavior: str | None = None) -> Plat
 
 @functools.cache
 def _machine() -> dict[str, Any]:
-    """The fields that do not depend on the environment."""
     import torch
 
     libc = " ".join(filter(None, platform.libc_ver()))
@@ -136,7 +133,6 @@ def _packages(environment: Environment, behavior: str | None) -> dict[str, str]:
 
 
 def _text(value: str) -> str:
-    """A text of the machine as a record may hold it."""
     return printable(value)[:TEXT_LENGTH]
 
 
@@ -282,12 +278,7 @@ class PartRecord(Record):
 
 
 def read_part_record(archive: Archive) -> PartRecord:
-    """Reads `part.json` of a part and checks that its id is its identity's digest.
-
-    Raises:
-        StoreError: the archive is damaged or holds no record.
-        ManifestError: names the file and the field.
-    """
+    """Reads `part.json` of a part and checks that its id is its identity's digest."""
     place = archive.place(RECORD)
     try:
         values = parse_json(archive.read(RECORD, limit=PART_RECORD_BYTES))
@@ -320,9 +311,6 @@ def check_members(archive: Archive, record: PartRecord) -> list[ArrayLayout]:
 
     Returns:
         The layouts of the arrays.
-
-    Raises:
-        StoreError: names the file.
     """
     layouts = check_layout(
         archive, {name: array.model_dump() for name, array in record.identity.arrays.items()}

@@ -14,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 
-from tcmrl_data.foundation.canonical import canonical_json, sha256
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.plain_files import printable
-from tcmrl_data.foundation.records import first_problem
+from tcmrl_data.foundation.files import printable
+from tcmrl_data.foundation.records import canonical_json, first_problem, sha256
 from tcmrl_data.store.part import PartRecord
 from tcmrl_data.store.tables import MAX_COUNT, MAX_INDEX, MAX_PLATFORMS, RUN_NAME, SHA256, PartKey, blocks
 
@@ -223,10 +222,6 @@ class PartTable:
 def parse_parts(data: bytes, file: Path) -> PartTable:
     """The parts of a table's lines.
 
-    Args:
-        data: complete lines, the header first.
-        file: the table, for error messages.
-
     Raises:
         ManifestError: lines that were not written here, or a part that stands there twice.
     """
@@ -280,5 +275,4 @@ def _columns(block: bytes, runs: dict[str, int], file: Path) -> dict[str, npt.ND
 
 
 def _ranks(runs: Sequence[str]) -> npt.NDArray[np.int64]:
-    """The position of every run among the runs' sorted names."""
     return np.argsort(np.argsort(np.array(runs, dtype=np.str_)))

@@ -15,11 +15,10 @@ from typing import Annotated, Any, Literal, NamedTuple
 from pydantic import FailFast, Field, TypeAdapter, ValidationError
 
 from tcmrl_data.envs.base import Task
-from tcmrl_data.foundation.canonical import canonical_json, parse_json
 from tcmrl_data.foundation.disk import STAGING, disk, make_own, named_errors
 from tcmrl_data.foundation.errors import BuildError, ManifestError, TaskError
-from tcmrl_data.foundation.plain_files import one_line, open_plain_file, printable
-from tcmrl_data.foundation.records import Record, first_problem, hidden_text
+from tcmrl_data.foundation.files import one_line, open_plain_file, printable
+from tcmrl_data.foundation.records import Record, canonical_json, first_problem, hidden_text, parse_json
 
 MAIN_RUN = "main"
 RUN_NAME = r"[a-z0-9_-]{1,64}"
@@ -97,9 +96,6 @@ def check_plan(*, tasks: int, steps: int, columns: int, largest_task: int) -> No
     Args:
         columns: width of observations or actions, whichever is larger.
         largest_task: bytes of the longest line of a task.
-
-    Raises:
-        BuildError: names the limit and what exceeds it.
     """
     for what, found, limit in (
         ("tasks", tasks, MAX_TASKS),
@@ -203,11 +199,7 @@ class TableWriter:
         self._is_named = bool(lines)
 
     def append(self, lines: bytes) -> None:
-        """Writes complete lines behind the others; not forced to disk before they are sealed.
-
-        Raises:
-            StorageError: the operating system refuses the operation; the lines do not count then.
-        """
+        """Writes complete lines behind the others; not forced to disk before they are sealed."""
         if lines:
             self._make_own()
             hashed, seal = self._state[0].copy(), self._state[1]
@@ -222,11 +214,7 @@ class TableWriter:
             self._state = (hashed, seal)  # one step, so that an interruption leaves the two in agreement
 
     def sync(self) -> None:
-        """Forces the lines, and the name of a new table, to disk, and cuts off what stands behind them.
-
-        Raises:
-            StorageError: the operating system refuses the operation.
-        """
+        """Forces the lines, and the name of a new table, to disk, and cuts off what stands behind them."""
         self._make_own()
         with named_errors(self._file):
             if self.has_more:
@@ -272,10 +260,6 @@ def task_line(task: Task) -> bytes:
 
 def parse_tasks(data: bytes, file: Path) -> tuple[Task, ...]:
     """The tasks of a table's lines, ascending by index.
-
-    Args:
-        data: complete lines.
-        file: the table, for error messages.
 
     Raises:
         ManifestError: lines that were not written here, or a task that stands there twice.

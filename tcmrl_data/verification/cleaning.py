@@ -71,12 +71,7 @@ def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage
 
 @contextlib.contextmanager
 def _idle(folder: Path, *, dry_run: bool) -> Iterator[None]:
-    """Holds the lock of a dataset; a dry run, which writes no lock file, looks whether another process does.
-
-    Raises:
-        BuildError: the dataset's work folders are links.
-        LockedError: a process works on the dataset; names it.
-    """
+    """Holds the lock of a dataset; a dry run, which writes no lock file, only asks for its holder."""
     check_work_files(folder)
     if not dry_run:
         with lock_file(folder / LOCK, f"dataset {folder}"):
@@ -140,7 +135,6 @@ class Deletion:
 
     Attributes:
         files: number of files, without work files.
-        bytes: their size.
         kept: files that are no part of a dataset, relative to the folder; they stay, and so does the folder.
     """
 
@@ -213,7 +207,6 @@ def _remove(folder: Path, scan: Scan) -> None:
 
 
 def _remove_empty(folders: Iterable[Path]) -> None:
-    """Removes folders that hold nothing, the deepest first."""
     for folder in sorted(folders, reverse=True):
         with contextlib.suppress(OSError):
             folder.rmdir()

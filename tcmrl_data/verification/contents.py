@@ -14,7 +14,7 @@ from pydantic import ValidationError
 from tcmrl_data.behavior.base import GaussianDescription, read_snapshot
 from tcmrl_data.envs.base import Environment, Split, Task, draw_tasks
 from tcmrl_data.foundation.errors import ManifestError, SnapshotError, StoreError, TcmrlError, TrajectoryError
-from tcmrl_data.foundation.plain_files import file_problem, folder_problem, one_line, words_after
+from tcmrl_data.foundation.files import file_problem, folder_problem, one_line, words_after
 from tcmrl_data.foundation.records import first_problem
 from tcmrl_data.parts.making import statistics
 from tcmrl_data.parts.own_operations import SUBSET, read_cut
@@ -50,10 +50,8 @@ class PartChecks:
         """Yields what is wrong with a part.
 
         Args:
-            file: its path relative to the dataset.
             status: its status; None where it is missing.
             entry: its line in the table; None where the table cannot tell.
-            opened: whether its archive is looked into.
         """
         if status is None:
             blocked = folder_problem(self._folder, file.rpartition("/")[0])
@@ -73,12 +71,6 @@ class PartChecks:
                 yield words_after(error, self._folder / file)
 
     def _archive_problems(self, archive: Archive, entry: PartEntry | None) -> Iterator[str]:
-        """Problems of an archive whose directory is sound.
-
-        Raises:
-            StoreError: its members are not those of its record.
-            ManifestError: its record cannot be read.
-        """
         if entry is not None and archive.sha256() != entry.sha256:
             yield "content does not have the recorded sha256"
             return
@@ -94,7 +86,6 @@ class PartChecks:
                 yield f"{name}: {problem}"
 
     def _record_problems(self, record: PartRecord, entry: PartEntry) -> Iterator[str]:
-        """How a part's record differs from what the dataset says of it."""
         assert self._description.manifest is not None
         run, task = self._runs.get(entry.run), self._tasks.get(entry.task)
         if TASKS in self._description.unreadable:  # a finding of its own; the part tells its task
@@ -126,7 +117,6 @@ def content_problems(archive: Archive, record: PartRecord, recipe: Recipe | None
 
     Args:
         archive: the part; its members have been checked.
-        record: its record.
         recipe: what it was built from; None where that is not known.
     """
     environment = None if recipe is None else recipe_environment(recipe)
@@ -171,8 +161,6 @@ def task_problems(tasks: Sequence[Task], recipe: Recipe, splits: Mapping[int, Sp
     """Yields the differences of a dataset's tasks from those that its recipe draws.
 
     Args:
-        tasks: the dataset's.
-        recipe: the dataset's.
         splits: of tasks whose split is not the one that the recipe draws, as a derivation says.
     """
     environment = recipe_environment(recipe)
@@ -296,12 +284,7 @@ def _identity_problems(
     """How a part's record differs from what the dataset says of it.
 
     Args:
-        record: of the part.
-        entry: its line in the table.
-        task: of the part.
-        run: of the part.
         settings: of the run's recipe; None where the run was not built.
-        data_version: of the dataset.
     """
     identity = record.identity
     for name, found, wanted in (

@@ -10,7 +10,7 @@ from typing import Literal
 from tcmrl_data.building.work_files import WORK_FILES, WORK_FOLDERS
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.plain_files import one_line, status_of, words_after
+from tcmrl_data.foundation.files import one_line, status_of, words_after
 from tcmrl_data.store.manifest import MANIFEST, Manifest, is_complete, read_manifest
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_parts
 from tcmrl_data.store.tables import (
@@ -108,7 +108,6 @@ def scan_dataset(folder: Path, *, follow: bool = True) -> Scan:
     """Lists a dataset, work files left out where they are of their kind.
 
     Args:
-        folder: the dataset.
         follow: list what links in the places of parts and tables lead to; else the links themselves.
     """
     scan = Scan({}, set(), {}, set())
@@ -196,7 +195,6 @@ class Description:
                 self._add(name, words_after(error, file))
 
     def _check_tables(self, manifest: Manifest) -> None:
-        """Compares the manifest and those tables that can be read with each other."""
         table = self.table
         indices = {task.index for task in self.tasks}
         if TASKS not in self.unreadable:
@@ -212,7 +210,6 @@ class Description:
             self._check_sums(manifest, table)
 
     def _check_sums(self, manifest: Manifest, table: PartTable) -> None:
-        """Compares the manifest's sums with the table."""
         kept = table.without_tasks(manifest.dropped)
         expected = {
             "root": kept.root,

@@ -3,12 +3,14 @@
 import contextlib
 import stat
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from tcmrl_data.building.build import build_dataset
 from tcmrl_data.building.work_files import BuildEvent, check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
+from tcmrl_data.envs.base import Task, draw_tasks
 from tcmrl_data.foundation.disk import (
     LOCK,
     STAGING,
@@ -20,30 +22,44 @@ from tcmrl_data.foundation.disk import (
 )
 from tcmrl_data.foundation.errors import (
     BuildError,
+    ManifestError,
     NondeterminismError,
     ReadOnlyError,
     SelectionError,
     StoreError,
 )
-from tcmrl_data.foundation.plain_files import folder_problem, read_plain_file
+from tcmrl_data.foundation.files import folder_problem, read_plain_file
+from tcmrl_data.foundation.machine import available_cores
 from tcmrl_data.parts.jobs import DeriveSpec, Job, derive_parts
 from tcmrl_data.parts.making import Published, numbered, read_published
 from tcmrl_data.parts.operation import can_be_made_again
 from tcmrl_data.parts.own_operations import operation_of_run
+from tcmrl_data.recipe.recipe import choose_tasks
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.manifest import (
     MANIFEST,
     MANIFEST_COPY,
+    Manifest,
     Run,
     dataset_folder,
     read_manifest,
     restore_manifest,
+    write_dataset,
 )
 from tcmrl_data.store.part import Platform, this_platform
-from tcmrl_data.store.part_table import PARTS_TABLE, PartTable
-from tcmrl_data.store.tables import MAIN_RUN, TASKS, PartKey, part_file
-from tcmrl_data.verification.description import Finding, VerifyLevel
-from tcmrl_data.verification.restoring import restore_tables, write_tables
+from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_entries, parse_parts
+from tcmrl_data.store.tables import (
+    MAIN_RUN,
+    TASKS,
+    PartKey,
+    key_of_file,
+    parse_tasks,
+    part_file,
+    read_lines,
+    read_sealed,
+)
+from tcmrl_data.verification.contents import recipe_environment
+from tcmrl_data.verification.description import Finding, VerifyLevel, scan_dataset
 from tcmrl_data.verification.verify import find_problems, verify_dataset
 
 REPAIR = "repair"
@@ -168,15 +184,10 @@ class _Repair:
         )
 
     def _dataset(self) -> Dataset:
-        """The dataset as it now stands."""
         return Dataset(self._folder, read_manifest(self._folder))
 
     def _make_parts(self, keys: Sequence[PartKey]) -> tuple[str, ...]:
-        """Makes parts again and puts them in their places: built ones first, then what was made from them.
-
-        Returns:
-            One line per failure; the parts of that run, and of later ones, are then as they were.
-        """
+        """Makes parts again and puts them in their places: built ones first, then what was made from them."""
         dataset = self._dataset()
         runs = {run.name: run for run in dataset.manifest.runs}
         for key in keys:
@@ -234,16 +245,10 @@ def _lasting_damage(dataset: Dataset, run: Run | None, key: PartKey) -> str | No
 
 
 def _source_of(run: Run, key: PartKey) -> PartKey:
-    """The part that a part of a derived run was made from."""
     return PartKey(run.source_of(key.task), key.step, str((run.origin or {}).get("of", MAIN_RUN)))
 
 
 def _check_platforms(dataset: Dataset, runs: Mapping[str, Run], keys: Sequence[PartKey]) -> None:
-    """Refuses to make parts of another platform again, before the work.
-
-    Raises:
-        NondeterminismError: names the first part, what differs, and what helps.
-    """
     here: dict[str, Platform] = {}
     simulating = {name for name in {key.run for key in keys} if operation_of_run(runs[name]).simulates}
     for key in keys:
@@ -263,11 +268,7 @@ def _check_platforms(dataset: Dataset, runs: Mapping[str, Run], keys: Sequence[P
 
 
 def _copy_parts(dataset: Dataset, keys: Sequence[PartKey], copy: str | Path) -> list[PartKey]:
-    """Takes parts from another dataset that holds them with the digests of the table; returns their keys.
-
-    Raises:
-        ManifestError: there is no dataset at `copy`.
-    """
+    """Takes parts from another dataset that holds them with the digests of the table; returns their keys."""
     other = open_dataset(copy)
     places = {entry.sha256: entry.key for entry in other.recorded_parts.entries()}
     taken = []
@@ -282,7 +283,6 @@ def _copy_parts(dataset: Dataset, keys: Sequence[PartKey], copy: str | Path) -> 
 
 
 def _put(folder: Path, key: PartKey, data: bytes) -> None:
-    """Puts a part in its place, and takes away what is in the way."""
     _clear(folder, part_file(key))
     replace_file(folder / part_file(key), data, staging=folder / STAGING)
 
@@ -331,15 +331,7 @@ def _build_again(
     """Builds the tasks of damaged parts in a folder, where their sound parts lie; their groups train along.
 
     Args:
-        dataset: that holds the damaged parts.
-        run: a built run.
-        keys: of the run's damaged parts.
-        target: folder for the new parts.
-        workers: units run at the same time.
         progress: called with the events of the build.
-
-    Returns:
-        One line per failure.
     """
     assert run.recipe is not None
     assert run.seed is not None
@@ -392,3 +384,116 @@ def _derive_again(
     except (BuildError, StoreError) as error:
         return (str(error),)
     return ()
+
+
+def restore_tables(folder: Path, manifest: Manifest) -> None:
+    """Writes damaged tables again, from the parts and the recipe.
+
+    Raises:
+        BuildError: what was found does not have the manifest's root, or not its number of tasks; nothing was
+            written.
+    """
+    platforms = list(manifest.platforms)
+    try:
+        table = parse_parts(read_sealed(folder / PARTS_TABLE, manifest.parts), folder / PARTS_TABLE)
+    except ManifestError:
+        table = _recover_parts(folder, manifest, platforms)
+    try:
+        tasks = parse_tasks(read_sealed(folder / TASKS, manifest.tasks), folder / TASKS)
+    except ManifestError:
+        tasks = _draw_again(table, manifest)
+    if len(tasks) != manifest.tasks.lines or table.without_tasks(manifest.dropped).root != manifest.root:
+        raise BuildError(
+            f"{folder}: its tables are damaged, and what its parts tell does not have the manifest's root; "
+            f"delete {MANIFEST} and {MANIFEST_COPY} and run the first `tcmrl-data build` again, which keeps "
+            "the sound parts"
+        )
+    write_tables(folder, manifest, tasks=tasks, table=table, platforms=platforms)
+
+
+def write_tables(
+    folder: Path,
+    manifest: Manifest,
+    *,
+    tasks: Sequence[Task],
+    table: PartTable,
+    platforms: Sequence[Platform],
+) -> None:
+    """Replaces the tables and then the manifest that seals them.
+
+    If this is interrupted the tables are not those of the manifest, and `restore_tables` finds them again.
+    """
+    write_dataset(
+        folder,
+        name=manifest.name,
+        label=manifest.label,
+        data_version=manifest.data_version,
+        runs=manifest.runs,
+        derivation=manifest.derivation,
+        platforms=platforms,
+        tasks=tasks,
+        dropped=manifest.dropped,
+        table=table,
+    )
+
+
+def _recover_parts(folder: Path, manifest: Manifest, platforms: list[Platform]) -> PartTable:
+    """The table that has the manifest's root, of sound parts and of sound lines; the last if none has it.
+
+    A damaged part stands in its line alone. A sound part without a line may not be recorded yet.
+    """
+    sound = {entry.key: entry for entry in numbered(_read_parts(folder), platforms)}
+    lines = b""
+    with contextlib.suppress(ManifestError):  # no plain file at all
+        lines = read_lines(folder / PARTS_TABLE, manifest.parts.bytes)
+    recorded = {
+        entry.key: entry
+        for line in lines.splitlines(keepends=True)
+        for entry in parse_entries(line)
+        if entry.platform < len(manifest.platforms)
+    }
+    in_lines = {key: sound.get(key, entry) for key, entry in recorded.items()}
+    choices = (recorded | sound, in_lines, sound)
+    for entries in choices:
+        table = PartTable.empty().with_entries(list(entries.values()))
+        if table.without_tasks(manifest.dropped).root == manifest.root:
+            break
+    return table
+
+
+def _read_parts(folder: Path) -> list[Published]:
+    keys = sorted(key for key in map(key_of_file, scan_dataset(folder).files) if key is not None)
+
+    def read(key: PartKey) -> Published | None:
+        try:
+            published = read_published(folder / part_file(key), key.run)[0]
+        except (StoreError, ManifestError):
+            return None
+        return published if published.entry.key == key else None
+
+    with ThreadPoolExecutor(available_cores()) as pool:
+        return [part for part in pool.map(read, keys) if part is not None]
+
+
+def _draw_again(table: PartTable, manifest: Manifest) -> tuple[Task, ...]:
+    """The tasks of the parts and of the recipe's choice, as the recipe draws them.
+
+    Their splits are those of the derivation, if it has changed any.
+    """
+    if not manifest.is_drawn:
+        raise BuildError(
+            f"{TASKS} is damaged, and nobody can draw the tasks of foreign data; import or record them again"
+        )
+    recipe = manifest.recipe
+    environment = recipe_environment(recipe)
+    if isinstance(environment, str):
+        raise ManifestError(f"{MANIFEST}: {environment}")
+    present = set(table.columns["task"].tolist())
+    if len(present) < manifest.tasks.lines:
+        present |= {task.index for task in choose_tasks(recipe)}
+    splits = manifest.derivation.split_of_tasks() if manifest.derivation else {}
+    return tuple(
+        replace(task, split=splits.get(task.index, task.split))
+        for task in draw_tasks(environment)
+        if task.index in present
+    )

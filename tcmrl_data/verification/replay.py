@@ -12,11 +12,11 @@ from pydantic import ValidationError
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.foundation.errors import ManifestError, SelectionError, SnapshotError, StoreError, TcmrlError
-from tcmrl_data.foundation.plain_files import one_line
+from tcmrl_data.foundation.files import one_line
 from tcmrl_data.operations.assembly import Plan, PlannedPart
+from tcmrl_data.operations.derive import Choice, plan_subset
 from tcmrl_data.operations.merge import MERGE, plan_merge
 from tcmrl_data.operations.split import plan_episodes, plan_fold
-from tcmrl_data.operations.subset import Choice, plan_subset
 from tcmrl_data.parts.making import one_thread
 from tcmrl_data.parts.operation import (
     MissingSourceError,
@@ -77,10 +77,6 @@ def replay_part(
     """Makes a part again by its operation and compares; None if a part that it was made from is not at hand.
 
     Args:
-        archive: the part.
-        record: its record.
-        key: the part's.
-        recipe: that it goes by.
         files: of the parts that it may name as its sources, by their ids.
     """
     identity, place = record.identity, str(archive.path)
@@ -132,9 +128,6 @@ def derived_problems(
     Parts of another platform are left out, since they come out with other bits here.
 
     Args:
-        folder: the dataset.
-        table: its parts.
-        runs: its runs by name.
         files: of the parts that others may be made from, by their ids.
         only: files of the parts that are made again.
     """
@@ -175,7 +168,6 @@ def _open_sources(
 
 
 def _contradictions(record: PartRecord, source: PartRecord) -> Iterator[str]:
-    """How a part contradicts the one that it was made from."""
     if record.identity.policy != source.identity.policy:
         yield "its policy is not that of"
     try:
@@ -244,7 +236,6 @@ def derivation_problems(
     """Does a dataset's derivation again, without writing, and yields files and how they differ.
 
     Args:
-        dataset: a derived dataset.
         sources: the datasets that it was derived from, in any order.
         made_again: its parts have been made again from those of the sources, which says enough of operations
             whose plan cannot be made again.
@@ -274,7 +265,6 @@ def derivation_problems(
 
 
 def _in_order(derivation: Derivation, sources: Sequence[Dataset]) -> list[Dataset]:
-    """The sources as the derivation names them; those of one root by digest, as a merge orders them."""
     ordered, left = [], sorted(sources, key=lambda source: source.manifest.digest)
     for wanted in derivation.sources:
         found = next((source for source in left if source.manifest.root == wanted.root), None)

@@ -17,8 +17,8 @@ from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.dataset.selection import is_view_file
 from tcmrl_data.foundation.disk import LOCK, lock_holder
 from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.foundation.files import file_problem, words_after
 from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.foundation.plain_files import file_problem, words_after
 from tcmrl_data.foundation.seeding import evenly_spread
 from tcmrl_data.parts.operation import can_be_made_again
 from tcmrl_data.store.archive import Archive
@@ -56,9 +56,7 @@ class VerifyReport:
     """Result of a verification.
 
     Attributes:
-        parts: number of parts checked.
         files: number of files found, without work files.
-        bytes: their total size.
         findings: everything that is wrong, ordered by file.
         notes: files of others beside the data; findings with `strict`.
     """
@@ -133,11 +131,7 @@ def find_problems(folder: Path, level: VerifyLevel) -> tuple[Finding, ...]:
 
 
 class _Verification:
-    """One run over a dataset; arguments as of `verify_dataset`.
-
-    Args:
-        is_locked: this process holds the dataset's lock.
-    """
+    """One run over a dataset; arguments as of `verify_dataset`."""
 
     def __init__(
         self,
@@ -262,7 +256,6 @@ class _Verification:
             return False
 
     def _check_odd_and_foreign(self, expected: set[str]) -> None:
-        """Files of other kinds (links, pipes, devices), and files that belong to nothing."""
         for file, status in self.scan.files.items():
             problem = file_problem(status)
             if file not in expected:
@@ -289,7 +282,6 @@ class _Verification:
 
 
 def _unnamed(file: str, manifest: Manifest) -> str:
-    """What to say of a part that no table names."""
     key = key_of_file(file)
     if key and key.task in manifest.dropped:
         return (

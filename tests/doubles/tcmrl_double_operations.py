@@ -7,8 +7,7 @@ import numpy as np
 from pydantic import Field
 
 from tcmrl_data import Trajectory
-from tcmrl_data.envs.controller import PlaybackController
-from tcmrl_data.envs.rollout import roll_out
+from tcmrl_data.envs.rollout import PlaybackController, roll_out
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator
 from tcmrl_data.parts.operation import Operation, Sources, WantedPart

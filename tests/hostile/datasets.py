@@ -14,9 +14,8 @@ import numpy.typing as npt
 from safetensors.numpy import load, save
 
 from tcmrl_data import BuildReport, open_dataset
-from tcmrl_data.foundation.canonical import canonical_json, digest, sha256
 from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.records import sealed
+from tcmrl_data.foundation.records import canonical_json, digest, sealed, sha256
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.arrays import array_digests, encode_arrays, read_arrays
 from tcmrl_data.store.manifest import MANIFEST

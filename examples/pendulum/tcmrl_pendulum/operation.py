@@ -5,7 +5,7 @@ from typing import Any, ClassVar, final
 
 from pydantic import Field
 
-from tcmrl_data.envs.controller import Trajectory
+from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.records import Record
 from tcmrl_data.parts.operation import Operation, Sources, WantedPart
 

@@ -1,13 +1,23 @@
-"""Reading files of strangers: regular files only, up to a size limit.
+"""Files that others may have made, hold or still be writing: read if regular, locked, waited for.
 
 Links and hard links to regular files are how people keep copies (`cp -al`, DVC, the Hub's cache), and are
 followed. What is no regular file is refused once it is open, before a byte of it is read.
+
+A lock is an open file description lock of Linux. Anyone may ask for its holder without taking it (unlike
+`flock`, which the package `filelock` takes), so that asking never makes a starting writer fail. It belongs to
+the open file, so two writers in one process exclude each other. NFS passes it to the server. The kernel
+releases it when its holder ends, however it ends.
 """
 
+import contextlib
+import errno
+import fcntl
 import os
 import stat
+import struct
+import time
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, Any, BinaryIO
 
 KINDS = {
     stat.S_IFLNK: "a link",
@@ -42,10 +52,6 @@ def status_of(entry: os.DirEntry[str]) -> os.stat_result:
 
 def read_plain_file(file: Path, *, limit: int) -> bytes:
     """Reads a regular file, also through links; does not block on a FIFO.
-
-    Args:
-        file: the file.
-        limit: maximum size in bytes.
 
     Raises:
         ValueError: not a regular file, or larger than the limit; the message does not name the file.
@@ -113,3 +119,94 @@ def one_line(error: Exception) -> str:
 def words_after(error: Exception, file: Path) -> str:
     """An error's message without the file name at its start."""
     return str(error).removeprefix(str(file)).lstrip(": ")
+
+
+NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP, errno.EINVAL)
+"""What file systems without locks answer."""
+
+_WHOLE_FILE = (0, 0, 0, 0)  # l_whence, l_start, l_len, and l_pid, which these locks leave at 0
+_FLOCK = "hhqqi4x"  # struct flock of 64-bit Linux
+
+
+def try_exclusive_lock(file: IO[Any]) -> bool:
+    """Takes the exclusive lock on a file; closing the file releases it.
+
+    Args:
+        file: open for writing.
+
+    Returns:
+        False, at once, if another open file holds the lock.
+
+    Raises:
+        OSError: the file system has no locks.
+    """
+    try:
+        fcntl.fcntl(file, fcntl.F_OFD_SETLK, struct.pack(_FLOCK, fcntl.F_WRLCK, *_WHOLE_FILE))
+    except (BlockingIOError, PermissionError):  # POSIX allows EAGAIN and EACCES
+        return False
+    return True
+
+
+def take_shared_lock(file: IO[Any]) -> None:
+    """Takes the shared lock on a file; waits while another open file holds the exclusive lock.
+
+    Args:
+        file: open for reading; closing it releases the lock.
+
+    Raises:
+        OSError: the file system has no locks.
+    """
+    fcntl.fcntl(file, fcntl.F_OFD_SETLKW, struct.pack(_FLOCK, fcntl.F_RDLCK, *_WHOLE_FILE))
+
+
+def is_locked(file: IO[Any]) -> bool:
+    """True if another open file holds the lock, exclusive or shared; asking never disturbs a writer.
+
+    Args:
+        file: may be open for reading only.
+
+    Returns:
+        False where the file system has no locks, since nobody can hold one there.
+    """
+    asked = struct.pack(_FLOCK, fcntl.F_WRLCK, *_WHOLE_FILE)
+    try:
+        found = struct.unpack(_FLOCK, fcntl.fcntl(file, fcntl.F_OFD_GETLK, asked))
+    except OSError as error:
+        if error.errno not in NO_LOCKS:
+            raise
+        return False
+    return bool(found[0] != fcntl.F_UNLCK)
+
+
+VISIBLE_SECONDS = 60.0
+"""NFS may remember the content of a folder for this long (its option `acdirmax`)."""
+
+FIRST_PAUSE, LONGEST_PAUSE = 0.05, 2.0
+
+
+def wait_until_visible(path: Path, *, deadline: float = VISIBLE_SECONDS) -> bool:
+    """Waits for a file or folder that another machine says it has made.
+
+    Args:
+        deadline: seconds to wait at most; a path that is there is never waited for.
+
+    Returns:
+        False if it is not there at the deadline.
+    """
+    end, pause = time.monotonic() + deadline, FIRST_PAUSE
+    while not path.exists():
+        left = end - time.monotonic()
+        if left <= 0:
+            return False
+        time.sleep(min(pause, left))
+        pause = min(2 * pause, LONGEST_PAUSE)
+        _look_again(path.parent)
+    return True
+
+
+def _look_again(folder: Path) -> None:
+    """Makes NFS ask the server what is in a folder, or in the next one above that is there."""
+    for place in (folder, *folder.parents):
+        with contextlib.suppress(OSError):
+            os.listdir(place)
+            return
