@@ -33,35 +33,20 @@ def values(seed: int = 1) -> Tensor:
     return torch.randn(2, 5, 8, generator=generator(seed))
 
 
+def small(**changes: Any) -> FocalPlusConfig:
+    return FocalPlusConfig.model_validate(SMALL | changes)
+
+
 def attention(tokens: Any = "steps") -> StepAttention:
-    return StepAttention(8, heads=2, tokens=tokens, generator=generator())
+    return StepAttention(small(tokens=tokens), generator=generator())
 
 
 def block(kind: Any = "both", *, share: float = 0.0) -> TransformerBlock:
-    return TransformerBlock(
-        8,
-        heads=2,
-        reduction=4,
-        attention=kind,
-        tokens="steps",
-        dropout=share,
-        generator=generator(),
-    )
+    return TransformerBlock(small(attention=kind, dropout=share), generator=generator())
 
 
 def network(tokens: Any = "steps") -> TransitionTransformer:
-    return TransitionTransformer(
-        8,
-        4,
-        hidden=8,
-        layers=2,
-        heads=2,
-        reduction=4,
-        attention="both",
-        tokens=tokens,
-        dropout=0.0,
-        generator=generator(),
-    )
+    return TransitionTransformer(8, small(tokens=tokens), generator=generator())
 
 
 def learner(**config: Any) -> FocalPlusLearner:
@@ -105,7 +90,7 @@ def test_a_trajectory_that_is_padding_alone_stays_finite() -> None:
 
 
 def test_the_gate_is_one_weight_per_transition_between_0_and_1() -> None:
-    made = TransitionGate(8, reduction=4, generator=generator())
+    made = TransitionGate(small(), generator=generator())
     gates = made(values() * 10)
     assert gates.shape == (2, 5, 1)
     assert gates.min() > 0 and gates.max() < 1

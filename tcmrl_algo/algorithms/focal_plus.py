@@ -39,10 +39,6 @@ from tcmrl_algo.algorithms.core.problem import Problem
 from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_data import Batch, BatchRequest, Steps
 
-AttentionKind = Literal["both", "sequence", "batch", "none"]
-
-TokenKind = Literal["steps", "literal"]
-
 LAYER_NORM_EPSILON = 1e-6
 
 
@@ -71,8 +67,8 @@ class FocalPlusConfig(MethodConfig):
     heads: int = Field(default=4, ge=1)
     reduction: int = Field(default=16, ge=1)
     dropout: float = Field(default=0.0, ge=0, lt=1)
-    attention: AttentionKind = "both"
-    tokens: TokenKind = "steps"
+    attention: Literal["both", "sequence", "batch", "none"] = "both"
+    tokens: Literal["steps", "literal"] = "steps"
     similarity: Literal["cosine", "dot"] = "cosine"
     temperature: float = Field(default=0.1, gt=0)
     momentum: float = Field(default=0.999, ge=0, le=1)
@@ -101,18 +97,16 @@ class StepAttention(nn.Module):
     Deviation: the published code also drops attention weights, which the fused product used here does not
     offer with a generator of one's own.
 
-    Args:
-        hidden: width, a multiple of `heads`.
-        tokens: `steps` lets the steps of a trajectory attend to each other. `literal` is the published
-            code, which makes a sequence of every single transition: the softmax over one token is 1, so
-            that nothing is mixed and an affine map is left.
+    The `tokens` that attend to each other are the `steps` of a trajectory. `literal` is the published code,
+    which makes a sequence of every single transition: the softmax over one token is 1, so that nothing is
+    mixed and an affine map is left.
     """
 
-    def __init__(self, hidden: int, *, heads: int, tokens: TokenKind, generator: torch.Generator) -> None:
+    def __init__(self, config: FocalPlusConfig, *, generator: torch.Generator) -> None:
         super().__init__()
-        self._heads, self._tokens = heads, tokens
-        self.inputs = linear(hidden, 3 * hidden, generator)
-        self.outputs = linear(hidden, hidden, generator)
+        self._heads, self._tokens = config.heads, config.tokens
+        self.inputs = linear(config.hidden, 3 * config.hidden, generator)
+        self.outputs = linear(config.hidden, config.hidden, generator)
 
     def forward(
         self, values: Float[Tensor, "lanes steps hidden"], mask: Bool[Tensor, "lanes steps"]
@@ -130,15 +124,14 @@ class StepAttention(nn.Module):
 class TransitionGate(nn.Module):
     """Batch-wise attention: one weight per transition, g_t = mean of sigmoid(W_2 tanh(W_1 x_t)), in (0, 1).
 
-    Args:
-        reduction: W_1 has `hidden // reduction` outputs.
+    W_1 has `hidden // reduction` outputs.
     """
 
-    def __init__(self, hidden: int, *, reduction: int, generator: torch.Generator) -> None:
+    def __init__(self, config: FocalPlusConfig, *, generator: torch.Generator) -> None:
         super().__init__()
-        narrow = max(hidden // reduction, 1)
-        self.narrow = linear(hidden, narrow, generator)
-        self.wide = linear(narrow, hidden, generator)
+        narrow = max(config.hidden // config.reduction, 1)
+        self.narrow = linear(config.hidden, narrow, generator)
+        self.wide = linear(narrow, config.hidden, generator)
 
     def forward(self, values: Float[Tensor, "*rows hidden"]) -> Float[Tensor, "*rows 1"]:
         gates: Tensor = torch.sigmoid(self.wide(torch.tanh(self.narrow(values))))
@@ -151,33 +144,19 @@ class TransformerBlock(nn.Module):
 
     Mix is attention over steps, or x_t g_t, or the sum of both (the published code's default of three ways
     to join them); FF is a perceptron with one hidden layer of four times the width and GELU. Deviation:
-    LayerNorm divides by the biased standard deviation, the published code by the unbiased one.
-
-    Args:
-        reduction: of the gate.
-        attention: what Mix holds; `none` leaves out the first residual.
-        tokens: as of `StepAttention`.
-        generator: draws the start, which is the same whatever `attention` is.
+    LayerNorm divides by the biased standard deviation, the published code by the unbiased one. Without
+    attention there is no first residual. The start is the same whatever `attention` is.
     """
 
-    def __init__(
-        self,
-        hidden: int,
-        *,
-        heads: int,
-        reduction: int,
-        attention: AttentionKind,
-        tokens: TokenKind,
-        dropout: float,
-        generator: torch.Generator,
-    ) -> None:
+    def __init__(self, config: FocalPlusConfig, *, generator: torch.Generator) -> None:
         super().__init__()
-        self._dropout = dropout
+        hidden, attention = config.hidden, config.attention
+        self._dropout = config.dropout
         self.norm = nn.LayerNorm(hidden, eps=LAYER_NORM_EPSILON)
         self.wide = linear(hidden, 4 * hidden, generator)
         self.narrow = linear(4 * hidden, hidden, generator)
-        gate = TransitionGate(hidden, reduction=reduction, generator=generator)
-        steps = StepAttention(hidden, heads=heads, tokens=tokens, generator=generator)
+        gate = TransitionGate(config, generator=generator)
+        steps = StepAttention(config, generator=generator)
         mixes = attention != "none"
         self.mix_norm = nn.LayerNorm(hidden, eps=LAYER_NORM_EPSILON) if mixes else None
         self.gate = gate if attention in ("both", "batch") else None
@@ -189,12 +168,7 @@ class TransformerBlock(nn.Module):
         mask: Bool[Tensor, "lanes steps"],
         generator: torch.Generator | None,
     ) -> Float[Tensor, "lanes steps hidden"]:
-        """The block's output.
-
-        Args:
-            values: x, one trajectory per lane.
-            generator: draws dropout; None drops nothing.
-        """
+        """The block's output for one trajectory per lane; `generator` draws dropout, None drops nothing."""
         if self.mix_norm is not None:
             mixed = self.mix(self.mix_norm(values), mask)
             values = values + dropout(mixed, self._dropout, generator)
@@ -213,40 +187,14 @@ class TransformerBlock(nn.Module):
 
 @final
 class TransitionTransformer(nn.Module):
-    """x_0 = tanh(Linear(inputs)), blocks, and z_t = tanh(Linear(x)) for every transition of a trajectory.
+    """x_0 = tanh(Linear(inputs)), blocks, and z_t = tanh(Linear(x)) for every transition of a trajectory."""
 
-    Args:
-        heads, reduction, attention, tokens, dropout: as of `TransformerBlock`.
-    """
-
-    def __init__(
-        self,
-        inputs: int,
-        latent: int,
-        *,
-        hidden: int,
-        layers: int,
-        heads: int,
-        reduction: int,
-        attention: AttentionKind,
-        tokens: TokenKind,
-        dropout: float,
-        generator: torch.Generator,
-    ) -> None:
+    def __init__(self, inputs: int, config: FocalPlusConfig, *, generator: torch.Generator) -> None:
         super().__init__()
-        self.first = linear(inputs, hidden, generator)
-        self.last = linear(hidden, latent, generator)
+        self.first = linear(inputs, config.hidden, generator)
+        self.last = linear(config.hidden, config.latent, generator)
         self.blocks = nn.ModuleList(
-            TransformerBlock(
-                hidden,
-                heads=heads,
-                reduction=reduction,
-                attention=attention,
-                tokens=tokens,
-                dropout=dropout,
-                generator=generator,
-            )
-            for _ in range(layers)
+            TransformerBlock(config, generator=generator) for _ in range(config.layers)
         )
 
     def forward(
@@ -269,18 +217,7 @@ class AttentiveEncoder(nn.Module):
     def __init__(self, problem: Problem, config: FocalPlusConfig, *, generator: torch.Generator) -> None:
         super().__init__()
         self.scaling = transition_scaling(problem)
-        self.transformer = TransitionTransformer(
-            len(self.scaling.mean),
-            config.latent,
-            hidden=config.hidden,
-            layers=config.layers,
-            heads=config.heads,
-            reduction=config.reduction,
-            attention=config.attention,
-            tokens=config.tokens,
-            dropout=config.dropout,
-            generator=generator,
-        )
+        self.transformer = TransitionTransformer(len(self.scaling.mean), config, generator=generator)
 
     def forward(
         self, steps: Steps, generator: torch.Generator | None = None
