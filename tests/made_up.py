@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from tcmrl_algo.algorithms.core.problem import Problem, Stage, StagePlan
 from tcmrl_algo.algorithms.core.settings import TrainingSettings
@@ -109,3 +110,20 @@ def trajectory(length: int, seed: int) -> Trajectory:
         ended,
         ended,
     )
+
+
+def scramble(values: Steps) -> Steps:
+    """The same real steps with other padding."""
+
+    def other(value: Tensor) -> Tensor:
+        mask = values.mask.reshape(values.mask.shape + (1,) * (value.ndim - values.mask.ndim))
+        return torch.where(mask, value, value + 3.0)
+
+    names = ("observations", "actions", "rewards", "next_observations")
+    return replace(values, **{name: other(getattr(values, name)) for name in names})
+
+
+def random(*shape: int, seed: int = 0) -> Tensor:
+    """Standard normal numbers in double precision, for gradient checks."""
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()

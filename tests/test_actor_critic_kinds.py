@@ -12,17 +12,17 @@ import torch
 from tcmrl_cli.train import tcmrl
 from torch import Tensor
 
-from tcmrl_algo.algorithms.core.actor_critic.base import ActorCritic, ConditionedRows, value_bounds
 from tcmrl_algo.algorithms.core.actor_critic.bc import BehaviorCloning
 from tcmrl_algo.algorithms.core.actor_critic.iql import ImplicitQLearning, advantage_weights, expectile_loss
 from tcmrl_algo.algorithms.core.actor_critic.sac import value_loss
-from tcmrl_algo.algorithms.core.context import KINDS, ContextAlgorithm, make_actor_critic
+from tcmrl_algo.algorithms.core.context import KINDS, ContextAlgorithm
 from tcmrl_algo.algorithms.core.losses import gaussian_log_likelihood, likelihood_loss
 from tcmrl_algo.algorithms.core.method import METHODS
 from tcmrl_algo.algorithms.core.networks import LIKELIHOOD_LOG_STD, LikelihoodPolicy
 from tcmrl_algo.algorithms.core.settings import ActorCriticSettings
 from tests.commands import in_process
-from tests.made_up import ACTION_DIM, TASKS, problem, steps
+from tests.made_up import ACTION_DIM, TASKS, random, steps
+from tests.test_actor_critic import made, metrics_of, rows_of
 from tests.test_algorithms import LANES, STEPS, Made, act, assert_equal
 
 CONTEXT_METHODS = [
@@ -33,26 +33,6 @@ CONTEXT_METHODS = [
 NEW_KINDS = ["iql", "bc"]
 GRADIENT_METHODS = ["corro", "pearl"]
 """Those whose contexts learn from the critics."""
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
-
-
-def made(kind: str, latent: int = 2, **table: Any) -> ActorCritic:
-    settings = ActorCriticSettings.model_validate({"kind": kind, "hidden": (8,), **table})
-    return make_actor_critic(settings, problem(), latent=latent, generator=torch.Generator().manual_seed(0))
-
-
-def rows_of(actor_critic: ActorCritic, number: int = 5) -> ConditionedRows:
-    return actor_critic.rows(
-        steps(TASKS, number, seed=1), torch.ones(TASKS, actor_critic.latent) * torch.arange(3.0).view(3, 1)
-    )
-
-
-def metrics_of(actor_critic: ActorCritic, rows: ConditionedRows) -> dict[str, Tensor]:
-    return actor_critic.losses(rows, torch.Generator().manual_seed(0))[1]
 
 
 def test_expectile_loss_weighs_targets_above_by_tau_and_below_by_the_rest() -> None:
@@ -153,20 +133,6 @@ def test_every_kind_has_its_class_and_the_default_is_the_published_one() -> None
         assert isinstance(made(kind), expected)
 
 
-def test_the_losses_of_iql_train_their_own_networks_and_never_the_targets() -> None:
-    actor_critic = made("iql")
-    own = {"loss/critic": "critics", "loss/value": "value", "loss/policy": "policy"}
-    for loss, network in own.items():
-        actor_critic.zero_grad()
-        metrics_of(actor_critic, rows_of(actor_critic))[loss].backward()  # type: ignore[no-untyped-call]
-        touched = {
-            name.split(".")[0]
-            for name, parameter in actor_critic.named_parameters()
-            if parameter.grad is not None and parameter.grad.any()
-        }
-        assert touched == {network}
-
-
 def test_iql_follows_its_equations() -> None:
     """Networks replaced by constants: Q' = 3 and 2, V = 1 everywhere, means 0, log std 0."""
     actor_critic = made("iql", gamma=0.5, reward_scale=2.0, clip_targets=False, latent=0)
@@ -189,38 +155,6 @@ def test_iql_follows_its_equations() -> None:
     assert std == pytest.approx(1.0, abs=0.15)
     exact = torch.distributions.Normal(0.0, std).log_prob(rows.actions).sum(dim=-1).mean()
     torch.testing.assert_close(found["loss/policy"], -100.0 * exact, rtol=1e-4, atol=1e-4)
-
-
-@pytest.mark.parametrize(("clip", "same"), [(True, True), (False, False)])
-def test_next_values_of_iql_beyond_the_bounds_count_as_the_bound(clip: bool, same: bool) -> None:
-    actor_critic = made("iql", clip_targets=clip)
-    assert isinstance(actor_critic, ImplicitQLearning)
-    found = []
-    for factor in (2.0, 3.0):
-        with torch.no_grad():
-            actor_critic.value.layers[-1].bias.fill_(factor * actor_critic.bounds[1] + 1e3)  # type: ignore[operator]
-        found.append(metrics_of(actor_critic, rows_of(actor_critic))["loss/critic"].item())
-    assert (found[0] == found[1]) is same
-
-
-def test_bounds_hold_no_entropy_bonus_where_the_kind_pays_none() -> None:
-    assert value_bounds(
-        ActorCriticSettings(kind="iql", gamma=0.5, reward_scale=3.0), problem()
-    ) == pytest.approx((-12.0, 6.0))
-    assert value_bounds(ActorCriticSettings(gamma=0.5, reward_scale=3.0), problem())[1] > 6.5
-
-
-def test_the_targets_of_iql_follow_by_tau_and_divergence_is_limited_by_the_largest_q() -> None:
-    actor_critic = made("iql", tau=0.25, gamma=0.5, reward_scale=3.0, divergence_factor=10.0)
-    assert isinstance(actor_critic, ImplicitQLearning)
-    last = [network.members[0].layers[-1] for network in (actor_critic.critics, actor_critic.target_critics)]
-    with torch.no_grad():
-        for layer, value in zip(last, (4.0, 0.0), strict=True):
-            layer.bias.fill_(value)  # type: ignore[union-attr, operator]
-    actor_critic.after_step()
-    assert last[1].bias.item() == pytest.approx(1.0)  # type: ignore[union-attr, operator]
-    assert actor_critic.limits() == pytest.approx({"actor_critic/largest_q": 120.0})
-    assert not actor_critic.optimizers()
 
 
 def test_cloning_is_the_mean_negative_likelihood_and_has_no_critic() -> None:
@@ -257,22 +191,6 @@ def test_iql_learns_the_better_of_stored_actions_and_cloning_their_mean() -> Non
         chosen[kind] = actor_critic.act(plain.observations[0], torch.zeros(40, 0)).mean(dim=0)
     assert chosen["iql"][0] > 0.5 and chosen["iql"][1].abs() < 0.25
     assert chosen["bc"].abs().max() < 0.25
-
-
-@pytest.mark.parametrize("critic_gradient", [False, True])
-@pytest.mark.parametrize("kind", NEW_KINDS)
-def test_the_gradient_reaches_contexts_only_where_asked(kind: str, critic_gradient: bool) -> None:
-    """Through Q's loss alone in `iql`, through the likelihood in `bc`."""
-    actor_critic = made(kind)
-    context = torch.ones(TASKS, 2, requires_grad=True)
-    rows = actor_critic.rows(steps(TASKS, 5, seed=1), context, critic_gradient=critic_gradient)
-    reached = set()
-    for name, value in metrics_of(actor_critic, rows).items():
-        if name.startswith("loss/") and value.requires_grad:
-            (gradient,) = torch.autograd.grad(value, context, retain_graph=True, allow_unused=True)
-            reached |= {name} if gradient is not None and bool(gradient.any()) else set()
-    training = "loss/critic" if kind == "iql" else "loss/policy"
-    assert reached == ({training} if critic_gradient else set())
 
 
 @pytest.mark.parametrize("name", GRADIENT_METHODS)

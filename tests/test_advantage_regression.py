@@ -18,14 +18,9 @@ from tcmrl_algo.algorithms.macaw import (
     weighted_likelihood,
 )
 from tcmrl_algo.algorithms.macaw_networks import WeightLinear, WeightPerceptron, apply_layer
-from tests.made_up import problem, trajectory
+from tests.made_up import problem, random, trajectory
 
 MASK = torch.tensor([[True, True, True], [True, True, False]])
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
 
 
 def weights_of(*advantages: float, largest: float = 20.0, temperature: float = 1.0) -> list[float]:

@@ -20,7 +20,17 @@ from tcmrl_algo.algorithms.core.settings import TrainingSettings
 from tcmrl_algo.training.config import stage_plan
 from tcmrl_data import Batch, Controller, LaneTransition, Steps, Trajectory, UniformController
 from tests.commands import in_process
-from tests.made_up import ACTION_DIM, OBSERVATION_DIM, TASKS, batch, batch_for, problem, settings, trajectory
+from tests.made_up import (
+    ACTION_DIM,
+    OBSERVATION_DIM,
+    TASKS,
+    batch,
+    batch_for,
+    problem,
+    scramble,
+    settings,
+    trajectory,
+)
 
 STEPS = 6
 """Of the whole training here: more than the doubles' first stages take, fewer than a second."""
@@ -123,17 +133,6 @@ def test_padding_changes_no_update(name: str) -> None:
     expected, found = plain.algorithm.tensors(), padded.algorithm.tensors()
     for key, value in expected.items():
         torch.testing.assert_close(found[key], value, msg=key, rtol=1e-3, atol=1e-4)
-
-
-def scramble(values: Steps) -> Steps:
-    """The same real steps with other padding."""
-
-    def other(value: Tensor) -> Tensor:
-        mask = values.mask.reshape(values.mask.shape + (1,) * (value.ndim - values.mask.ndim))
-        return torch.where(mask, value, value + 3.0)
-
-    names = ("observations", "actions", "rewards", "next_observations")
-    return replace(values, **{name: other(getattr(values, name)) for name in names})
 
 
 @every

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from tcmrl_algo import create_algorithm, open_run, resolve_for, train_run
 from tcmrl_algo.algorithms.borel import (
@@ -33,7 +32,7 @@ from tcmrl_data import (
     UniformController,
 )
 from tests.context_learners import gradients, losses_of
-from tests.made_up import batch_for, problem, settings, steps, trajectory
+from tests.made_up import batch_for, problem, random, settings, steps, trajectory
 
 SMALL: dict[str, Any] = {"belief": 2, "recurrent_hidden": 6, "decoder_hidden": (4,)}
 MASK = torch.tensor([[True, True, True], [True, True, False]])
@@ -58,11 +57,6 @@ def learner(**config: Any) -> BorelLearner:
 
 def batch(*, seed: int = 0) -> Batch:
     return batch_for(Borel().batch_request(settings(), BorelConfig()), seed=seed)
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
 
 
 def test_gradients_of_both_losses_are_right() -> None:

@@ -28,6 +28,7 @@ from tests.made_up import (
     batch,
     batch_for,
     problem,
+    random,
     settings,
     trajectory,
     with_steps,
@@ -57,11 +58,6 @@ def stages_of(negatives: str = "cvae", *, steps: int = 100, **config: Any) -> St
 def batch_of(stage: str, negatives: str = "cvae") -> Batch:
     (request,) = [found.request for found in stages_of(negatives) if found.name == stage]
     return batch_for(request, seed=1)
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
 
 
 def contrast(*cosines: float, temperature: float = 0.1) -> float:

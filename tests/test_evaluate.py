@@ -13,7 +13,7 @@ from tcmrl_cli.frame import print_table
 from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import PROTOCOLS, Evaluation, TaskResult, evaluate_run, open_run, resolve, train_run
-from tcmrl_algo.evaluation.evaluate import PathPlot
+from tcmrl_algo.evaluation.evaluate import check_plot
 from tcmrl_data import (
     CheckpointError,
     Dataset,
@@ -233,12 +233,9 @@ def test_plot_draws_the_paths_in_the_test_tasks(trained: Path, call: Call, tmp_p
     assert list(tmp_path.iterdir()) == [file]
 
 
-def test_paths_without_a_plane_cannot_be_drawn(trained: Path, tiny: Dataset, tmp_path: Path) -> None:
-    settings = open_run(trained).record.config.settings.run
-    elsewhere = Dataset(tiny.folder, tiny.manifest)
-    vars(elsewhere)["environment"] = environment_of("half-cheetah-vel")
+def test_paths_without_a_plane_cannot_be_drawn(tmp_path: Path) -> None:
     with pytest.raises(TcmrlError, match="half-cheetah-vel has no paths in a plane"):
-        PathPlot(tmp_path / "paths.png", elsewhere, settings)
+        check_plot(tmp_path / "paths.png", environment_of("half-cheetah-vel"))
 
 
 def test_evaluate_command_compares_all_protocols(trained: Path, call: Call) -> None:

@@ -32,13 +32,9 @@ from tcmrl_algo.algorithms.tcmrl_variants import (
     literal_sparsity_loss,
     orthogonality_loss,
 )
+from tests.made_up import random
 
 YES = torch.tensor([[True, True]])
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
 
 
 MASK = torch.tensor([[True, True, True], [True, True, False]])

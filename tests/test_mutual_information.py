@@ -4,17 +4,12 @@ import math
 
 import pytest
 import torch
-from torch import Tensor
 
 from tcmrl_algo.algorithms.csro import club_likelihood, club_penalty
 from tcmrl_algo.algorithms.unicorn import gaussian_reconstruction, task_classification
+from tests.made_up import random
 
 MASK = torch.tensor([[True, True, True], [True, True, False]])
-
-
-def random(*shape: int, seed: int = 0) -> Tensor:
-    generator = torch.Generator().manual_seed(seed)
-    return torch.randn(*shape, generator=generator, dtype=torch.float64).requires_grad_()
 
 
 def test_gradients_are_right() -> None:

@@ -18,7 +18,7 @@ from tcmrl_algo.algorithms.core.networks import call_frozen
 from tcmrl_algo.algorithms.tcmrl import negative_reward_loss, reverse_context, task_contrastive_loss
 from tcmrl_algo.experiment.spec import load_experiment
 from tcmrl_data import Batch, Steps
-from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, with_steps
+from tests.made_up import EPISODE, TASKS, batch, problem, scramble, settings, steps, with_steps
 
 SMALL: dict[str, Any] = {"latent": 4, "encoder_hidden": (8,), "tce_hidden": (8,), "estimator_hidden": (8,)}
 ONLY = dict.fromkeys(tcmrl.Weights.model_fields, 0.0)
@@ -48,22 +48,6 @@ def losses_of(made: tcmrl.TcmrlLearner, values: Batch | None = None, seed: int =
 
 def terms_of(found: ContextLosses) -> set[str]:
     return {name.removeprefix("loss/") for name in found.metrics if name.startswith("loss/")}
-
-
-def scramble(values: Steps) -> Steps:
-    """The same real steps with other padding."""
-
-    def other(tensor: Tensor) -> Tensor:
-        mask = values.mask.reshape(values.mask.shape + (1,) * (tensor.ndim - values.mask.ndim))
-        return torch.where(mask, tensor, tensor + 3.0)
-
-    return replace(
-        values,
-        observations=other(values.observations),
-        actions=other(values.actions),
-        rewards=other(values.rewards),
-        next_observations=other(values.next_observations),
-    )
 
 
 def gradients(weights: dict[str, float]) -> dict[str, float]:

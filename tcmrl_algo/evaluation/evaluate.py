@@ -1,20 +1,20 @@
 """Meta-testing: adapts a trained run to the test tasks, and compares its returns with controls."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from statistics import fmean
-from typing import Any, Literal, final
+from typing import Any, Literal
 
 import numpy as np
 import torch
 
 from tcmrl_algo.algorithms.core.settings import RunSettings
 from tcmrl_algo.evaluation.arena import Arena, Context, ProgressCallback, ignore_progress
-from tcmrl_algo.evaluation.controls import Controls, dataset_controls
+from tcmrl_algo.evaluation.controls import TaskControls, dataset_controls
 from tcmrl_algo.evaluation.protocols.base import PROTOCOLS, Adaptation
-from tcmrl_algo.training.checkpoint import Run, open_run
+from tcmrl_algo.training.checkpoint import open_run
 from tcmrl_algo.training.config import method_of
 from tcmrl_algo.training.train import create_algorithm, log_evaluation
 from tcmrl_data import Dataset, Environment, RenderingError, Task, TrainingError, Trajectory
@@ -106,64 +106,53 @@ PLOT_FORMATS = (".pdf", ".png", ".svg")
 PANEL = 4.0
 """Width of a panel in inches."""
 
-
-@dataclass(frozen=True)
-class FinalEpisodes:
-    """The final episodes of an evaluation, by index of the test task.
-
-    Attributes:
-        adapted: with the task's own contexts.
-        other: with contexts of other tasks.
-    """
-
-    adapted: Mapping[int, Sequence[Trajectory]]
-    other: Mapping[int, Sequence[Trajectory]]
+FinalEpisodes = Mapping[int, Sequence[Trajectory]]
+"""The final episodes of an evaluation, by index of the test task."""
 
 
-@final
-class PathPlot:
-    """Draws a final episode of every test task, and beside it one under another task's context.
-
-    Args:
-        dataset: with environment and tasks.
+def check_plot(file: Path, environment: Environment) -> None:
+    """Refuses a picture that `draw_paths` cannot draw.
 
     Raises:
         RenderingError: the environment's paths cannot be drawn, or the file's ending is not known.
     """
+    if file.suffix.lower() not in PLOT_FORMATS:
+        raise RenderingError(f"--plot {file}: the name must end in {', '.join(PLOT_FORMATS)}")
+    if type(environment).draw_path is Environment.draw_path:
+        raise RenderingError(
+            f"--plot {file}: {environment.name} has no paths in a plane to draw; leave --plot out"
+        )
 
-    def __init__(self, file: Path, dataset: Dataset, settings: RunSettings) -> None:
-        if file.suffix.lower() not in PLOT_FORMATS:
-            raise RenderingError(f"--plot {file}: the name must end in {', '.join(PLOT_FORMATS)}")
-        if type(dataset.environment).draw_path is Environment.draw_path:
-            raise RenderingError(
-                f"--plot {file}: {dataset.environment.name} has no paths in a plane to draw; leave --plot out"
-            )
-        self._file, self._dataset, self._settings = file, dataset, settings
 
-    def __call__(self, episodes: FinalEpisodes) -> None:
-        """Writes the picture."""
-        from matplotlib import colormaps
-        from matplotlib.backends.backend_agg import FigureCanvasAgg
-        from matplotlib.colors import to_hex
-        from matplotlib.figure import Figure
+def draw_paths(
+    file: Path, dataset: Dataset, settings: RunSettings, adapted: FinalEpisodes, other: FinalEpisodes
+) -> None:
+    """Draws a final episode of every test task, and beside it one under another task's context."""
+    from matplotlib import colormaps
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.colors import to_hex
+    from matplotlib.figure import Figure
 
-        figure = Figure(figsize=(2 * PANEL, PANEL), layout="compressed")
-        FigureCanvasAgg(figure)
-        panels = figure.subplots(1, 2, sharex=True, sharey=True)
-        name = self._settings.algorithm
-        titles = (f"{name}, adapted ({self._settings.protocol})", f"{name}, other tasks' contexts")
-        colors = colormaps["turbo"](np.linspace(0.05, 0.95, len(episodes.adapted)))
-        for axes, title, found in zip(panels, titles, (episodes.adapted, episodes.other), strict=True):
-            for place, (index, trajectories) in enumerate(found.items()):
-                color, parameters = colors[place], self._dataset.task(index).parameters
-                # contexts of several other tasks take turns
-                observations = trajectories[place % len(trajectories)].observations
-                self._dataset.environment.draw_path(axes, parameters, observations, color=to_hex(color))
-            axes.set(title=title, xlabel="x")
-        panels[0].set_ylabel("y")
-        figure.suptitle(f"{self._dataset.name}: paths in {len(episodes.adapted)} test tasks")
-        figure.savefig(self._file, dpi=110, bbox_inches="tight")
+    figure = Figure(figsize=(2 * PANEL, PANEL), layout="compressed")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, 2, sharex=True, sharey=True)
+    name = settings.algorithm
+    titles = (f"{name}, adapted ({settings.protocol})", f"{name}, other tasks' contexts")
+    colors = colormaps["turbo"](np.linspace(0.05, 0.95, len(adapted)))
+    for axes, title, found in zip(panels, titles, (adapted, other), strict=True):
+        for place, (index, trajectories) in enumerate(found.items()):
+            # contexts of several other tasks take turns
+            observations = trajectories[place % len(trajectories)].observations
+            parameters, color = dataset.task(index).parameters, to_hex(colors[place])
+            dataset.environment.draw_path(axes, parameters, observations, color=color)
+        axes.set(title=title, xlabel="x")
+    panels[0].set_ylabel("y")
+    figure.suptitle(f"{dataset.name}: paths in {len(adapted)} test tasks")
+    figure.savefig(file, dpi=110, bbox_inches="tight")
 
+
+LOGGED = ("final", "shuffled", "regret", "normalized")
+"""Means that the run's curves hold."""
 
 MOST_OTHERS = 3
 """Most other tasks whose contexts are tried on a task; a single one may be very similar or dissimilar."""
@@ -210,37 +199,9 @@ def evaluate_run(
     }
     settings = settings.model_copy(update={key: value for key, value in changes.items() if value is not None})
     torch.set_num_threads(settings.threads)
-    show = ignore_episodes if plot is None else PathPlot(plot, dataset, settings)
-    evaluation = evaluate_open_run(run, dataset, settings, report=report, show=show)
-    scores = {
-        "final": evaluation.mean_final,
-        "shuffled": evaluation.mean_shuffled,
-        "regret": evaluation.mean_regret,
-        "normalized": evaluation.mean_normalized,
-    }
-    log_evaluation(run.folder, step=run.newest().step, protocol=evaluation.protocol, scores=scores)
-    return evaluation
-
-
-def ignore_episodes(episodes: FinalEpisodes) -> None:
-    """Ignores final episodes."""
-
-
-def evaluate_open_run(
-    run: Run,
-    dataset: Dataset,
-    settings: RunSettings,
-    *,
-    report: ProgressCallback = ignore_progress,
-    show: Callable[[FinalEpisodes], None] = ignore_episodes,
-) -> Evaluation:
-    """As `evaluate_run`, for an open run and dataset.
-
-    Args:
-        settings: may differ from those of the run.
-        show: called with the final episodes of all tasks.
-    """
-    protocol = PROTOCOLS.get(settings.protocol)()
+    if plot is not None:
+        check_plot(plot, dataset.environment)
+    adapts = PROTOCOLS.get(settings.protocol)()
     tasks = dataset.test_tasks
     if not tasks:
         raise TrainingError(
@@ -255,15 +216,19 @@ def evaluate_open_run(
     seed = run.record.seed
     controls = dataset_controls(dataset, report=report)
     arena = Arena(dataset, algorithm, settings, capabilities=method.capabilities, seed=seed, report=report)
-    repeats = settings.repeats if protocol.repeated else 1
+    repeats = settings.repeats if adapts.repeated else 1
     try:
         arena.begin("adaptation", len(tasks) * repeats * settings.episodes)
-        adaptations = protocol.adapt(arena, [task for task in tasks for _ in range(repeats)])
+        adaptations = adapts.adapt(arena, [task for task in tasks for _ in range(repeats)])
         by_task = [adaptations[repeats * place :][:repeats] for place in range(len(tasks))]
-        results = _results(arena, tasks, by_task, controls, show)
+        final, shuffled = _final_episodes(arena, tasks, by_task)
     finally:
         arena.close()
-    return Evaluation(
+    results = [
+        _result(dataset, task, ended, controls.task(task.index), final[task.index], shuffled[task.index])
+        for task, ended in zip(tasks, by_task, strict=True)
+    ]
+    evaluation = Evaluation(
         algorithm=settings.algorithm,
         environment=dataset.name,
         seed=seed,
@@ -279,50 +244,40 @@ def evaluate_open_run(
         mean_fixed=_mean([result.fixed for result in results]),
         privileged=run.record.privileged or method.capabilities.privileged,
     )
+    if plot is not None:
+        draw_paths(plot, dataset, settings, final, shuffled)
+    scores = {name: getattr(evaluation, f"mean_{name}") for name in LOGGED}
+    log_evaluation(run.folder, step=run.newest().step, protocol=evaluation.protocol, scores=scores)
+    return evaluation
 
 
-def _results(
-    arena: Arena,
-    tasks: Sequence[Task],
-    adaptations: Sequence[Sequence[Adaptation]],
-    controls: Controls,
-    show: Callable[[FinalEpisodes], None],
-) -> list[TaskResult]:
-    """Results of every task, given its adaptations, one per repeat."""
-    own = {
-        task.index: [context for adaptation in repeats for context in adaptation.contexts]
-        for task, repeats in zip(tasks, adaptations, strict=True)
-    }
-    others = {task.index: contexts_of_others(arena, task, own) for task in tasks}
-    num_contexts = sum(len(contexts) for contexts in (*own.values(), *others.values()))
-    arena.begin("final episodes", num_contexts * arena.settings.final_episodes)
-    final = _final_episodes(arena, tasks, own)
-    shuffled = _final_episodes(arena, tasks, others)
-    show(FinalEpisodes(final, shuffled))
-    results = []
-    for task, repeats in zip(tasks, adaptations, strict=True):
-        references, control = arena.dataset.references(task.index), controls.task(task.index)
-        mean = _mean_return(final[task.index])
-        reference, best = _reference(references.oracle, control.behavior, references.behavior)
-        results.append(
-            TaskResult(
-                task=task.index,
-                split=task.split,
-                returns=[fmean(found) for found in zip(*(one.returns for one in repeats), strict=True)],
-                final=mean,
-                finals=_finals(final[task.index], [len(one.contexts) for one in repeats]),
-                oracle=references.oracle,
-                random=references.uniform,
-                behavior=control.behavior,
-                fixed=control.fixed,
-                regret=None if references.oracle is None else references.oracle - mean,
-                normalized=_share(mean, references.uniform, best),
-                reference=reference,
-                success=_success(final[task.index]),
-                shuffled=_mean_return(shuffled[task.index]),
-            )
-        )
-    return results
+def _result(
+    dataset: Dataset,
+    task: Task,
+    adaptations: Sequence[Adaptation],
+    control: TaskControls,
+    final: Sequence[Trajectory],
+    shuffled: Sequence[Trajectory],
+) -> TaskResult:
+    """Result of a task, given its adaptations, one per repeat, and its final episodes."""
+    references, mean = dataset.references(task.index), _mean_return(final)
+    reference, best = _reference(references.oracle, control.behavior, references.behavior)
+    return TaskResult(
+        task=task.index,
+        split=task.split,
+        returns=[fmean(found) for found in zip(*(one.returns for one in adaptations), strict=True)],
+        final=mean,
+        finals=_finals(final, [len(one.contexts) for one in adaptations]),
+        oracle=references.oracle,
+        random=references.uniform,
+        behavior=control.behavior,
+        fixed=control.fixed,
+        regret=None if references.oracle is None else references.oracle - mean,
+        normalized=_share(mean, references.uniform, best),
+        reference=reference,
+        success=_success(final),
+        shuffled=_mean_return(shuffled),
+    )
 
 
 def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) -> list[Context]:
@@ -362,9 +317,20 @@ def _finals(trajectories: Sequence[Trajectory], num_contexts: Sequence[int]) -> 
 
 
 def _final_episodes(
-    arena: Arena, tasks: Sequence[Task], contexts: dict[int, list[Context]]
-) -> dict[int, list[Trajectory]]:
-    """Final episodes of all tasks with all their contexts, by task index."""
+    arena: Arena, tasks: Sequence[Task], adaptations: Sequence[Sequence[Adaptation]]
+) -> tuple[FinalEpisodes, FinalEpisodes]:
+    """Final episodes of all tasks with all their own contexts, and with those of other tasks."""
+    own = {
+        task.index: [context for adaptation in repeats for context in adaptation.contexts]
+        for task, repeats in zip(tasks, adaptations, strict=True)
+    }
+    others = {task.index: contexts_of_others(arena, task, own) for task in tasks}
+    num_contexts = sum(len(contexts) for contexts in (*own.values(), *others.values()))
+    arena.begin("final episodes", num_contexts * arena.settings.final_episodes)
+    return _episodes_with(arena, tasks, own), _episodes_with(arena, tasks, others)
+
+
+def _episodes_with(arena: Arena, tasks: Sequence[Task], contexts: dict[int, list[Context]]) -> FinalEpisodes:
     lanes = [(task, context) for task in tasks for context in contexts[task.index]]
     found: dict[int, list[Trajectory]] = {task.index: [] for task in tasks}
     for repeat in range(arena.settings.final_episodes):

@@ -8,10 +8,9 @@ import dataclasses
 import io
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import UnionType
-from typing import Any, Literal, TypeVar, get_args, get_type_hints
+from typing import Any, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import Field, TypeAdapter, ValidationError
 
 from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_algo.experiment.spec import Experiment, run_id
@@ -352,15 +351,19 @@ def read_table(kind: type[Row], file: Path) -> list[Row]:
         text = file.read_text(encoding="utf-8")
     except OSError as error:
         raise CheckpointError(f"{file}: {error.strerror}") from None
-    reader, parsers = csv.DictReader(io.StringIO(text)), _parsers(kind)
-    if reader.fieldnames != list(parsers):
-        raise CheckpointError(f"{file} has columns {reader.fieldnames}; they must be {list(parsers)}")
-    rows = []
+    reader, fields = csv.DictReader(io.StringIO(text)), _fields(kind)
+    columns: list[str] = [field.name for field in fields]
+    if reader.fieldnames != columns:
+        raise CheckpointError(f"{file} has columns {reader.fieldnames}; they must be {columns}")
+    rows, adapter, empty = [], TypeAdapter(kind), dict[Any, Any]({bool: False})
     for values in reader:
+        given = {field.name: values[field.name] or empty.get(field.type) for field in fields}
         try:
-            rows.append(kind(**{column: parse(values[column]) for column, parse in parsers.items()}))
-        except (KeyError, TypeError, ValueError) as error:
-            raise CheckpointError(f"{file}, line {reader.line_num}: {error}") from None
+            rows.append(adapter.validate_python(given))
+        except ValidationError as error:
+            first = error.errors()[0]
+            place = f"{file}, line {reader.line_num}, {first['loc'][0]}"
+            raise CheckpointError(f"{place}: {first['msg']}, not {first['input']!r}") from None
     return rows
 
 
@@ -368,7 +371,7 @@ def write_table(kind: type[Row], file: Path, rows: Iterable[Row]) -> None:
     """Writes dataclasses as a CSV file, floats with six significant digits."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    columns = list(_parsers(kind))
+    columns = [field.name for field in _fields(kind)]
     writer.writerow(columns)
     for row in rows:
         writer.writerow([_cell(getattr(row, column)) for column in columns])
@@ -382,19 +385,8 @@ def merged(old: Iterable[Row], new: Iterable[Row], key: Callable[[Row], Any]) ->
     return [rows[place] for place in sorted(rows, key=str)]
 
 
-def _parsers(kind: type[Any]) -> dict[str, Callable[[str], Any]]:
-    hints = get_type_hints(kind)
-    return {field.name: _parser(hints[field.name]) for field in dataclasses.fields(kind)}
-
-
-def _parser(hint: Any) -> Callable[[str], Any]:
-    if isinstance(hint, UnionType):
-        (inner,) = (part for part in get_args(hint) if part is not type(None))
-        return lambda text: inner(text) if text else None
-    if hint is bool:
-        return {YES: True, "": False}.__getitem__
-    parse: Callable[[str], Any] = hint
-    return parse
+def _fields(kind: type[Any]) -> tuple[dataclasses.Field[Any], ...]:
+    return dataclasses.fields(kind)
 
 
 def _cell(value: Any) -> str:

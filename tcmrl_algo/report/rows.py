@@ -28,6 +28,21 @@ RUNS, CURVES, WORTH = "runs.csv", "curves.csv", "worth.csv"
 HEX_DIGITS = 16
 """Of roots and digests."""
 UNKNOWN = "unknown"
+SHARED = (
+    "environment",
+    "behavior_seed",
+    "profile",
+    "method",
+    "algorithm",
+    "privileged",
+    "seed",
+    "fold",
+    "steps",
+)
+MEASURED = ("context_ratio", "centroid_accuracy", "attention_zero", "attention_nonzero")
+"""What a row has of `RunResult` and `ContextMeasures` as it is."""
+SPLIT = ("tasks", "own", "single", "uniform", "best", "worth", "low", "high")
+"""What a row has of a split of `Worth` as it is."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +208,7 @@ def add_rows(file: Path, sources: Iterable[Source]) -> list[RunRow]:
             curves += curve_rows(folder.resolve().name, result, source.experiment.protocols[0])
     _update(RunRow, file, rows, _run_key)
     if curves:
-        _update(CurveRow, file.with_name(CURVES), curves, _curve_key)
+        _update(CurveRow, file.with_name(CURVES), curves, _run_key)
     return rows
 
 
@@ -227,40 +242,21 @@ def run_rows(experiment: str, result: RunResult, stored: DatasetReturns | None) 
     contexts = result.contexts or ContextMeasures(tasks=0)
     other = settings.run.context_snapshots
     seconds, memory = result.training_seconds, result.peak_memory
+    shared: dict[str, Any] = {name: getattr(result, name) for name in SHARED}
+    shared |= {name: getattr(contexts, name) for name in MEASURED}
     return [
         RunRow(
             experiment=experiment,
-            environment=result.environment,
             dataset_profile=None if known is None else known.profile,
-            behavior_seed=result.behavior_seed,
             root=result.root[:HEX_DIGITS],
-            profile=result.profile,
-            method=result.method,
-            algorithm=result.algorithm,
-            privileged=result.privileged,
             actor_critic=actor_critic(settings, result.algorithm),
             snapshots=str(settings.run.snapshots),
             context_snapshots=None if other in (None, settings.run.snapshots) else str(other),
             tuned=None if tuned is None else f"{tuned.trials} x {tuned.steps} on {tuned.environment}",
-            seed=result.seed,
-            fold=result.fold,
             protocol=protocol,
             test_tasks=len(evaluation["tasks"]),
-            final=evaluation["mean_final"],
-            shuffled=evaluation["mean_shuffled"],
-            regret=evaluation["mean_regret"],
-            normalized=evaluation["mean_normalized"],
             success=success_rate(evaluation),
-            random=_mean(evaluation["tasks"], "random"),
-            oracle=_mean(evaluation["tasks"], "oracle"),
-            behavior=_mean(evaluation["tasks"], "behavior"),
-            fixed=_mean(evaluation["tasks"], "fixed"),
             stored=None if known is None or result.fold is not None else known.test_return,
-            context_ratio=contexts.context_ratio,
-            centroid_accuracy=contexts.centroid_accuracy,
-            attention_zero=contexts.attention_zero,
-            attention_nonzero=contexts.attention_nonzero,
-            steps=result.steps,
             policy_steps=tuple(stage_plan(result.config))[-1].steps,
             ms_per_step=None if seconds is None else 1e3 * seconds / result.steps,
             peak_mb=None if memory is None else memory / 1e6,
@@ -268,23 +264,24 @@ def run_rows(experiment: str, result: RunResult, stored: DatasetReturns | None) 
             settings=settings_digest(result),
             commit=result.commit or UNKNOWN,
             processor=result.processor or UNKNOWN,
+            **shared,
+            **_scores(evaluation),
         )
         for protocol, evaluation in result.evaluations.items()
     ]
 
 
+def _scores(evaluation: dict[str, Any]) -> dict[str, Any]:
+    scores = {name: evaluation[f"mean_{name}"] for name in ("final", "shuffled", "regret", "normalized")}
+    others = ("random", "oracle", "behavior", "fixed")
+    return scores | {name: _mean(evaluation["tasks"], name) for name in others}
+
+
 def curve_rows(experiment: str, result: RunResult, protocol: str) -> list[CurveRow]:
     """The points of a learning curve; none of one that has its end alone."""
-    where = (
-        experiment,
-        result.environment,
-        result.root[:HEX_DIGITS],
-        result.method,
-        result.seed,
-        result.fold,
-    )
+    run = (result.environment, result.root[:HEX_DIGITS], result.method, result.seed, result.fold)
     points = result.curve if len(result.curve) > 1 else ()
-    return [CurveRow(*where, protocol, point.step, point.final, point.shuffled) for point in points]
+    return [CurveRow(experiment, *run, protocol, point.step, point.final, point.shuffled) for point in points]
 
 
 def worth_rows(dataset: str, worth: Worth) -> list[WorthRow]:
@@ -293,28 +290,12 @@ def worth_rows(dataset: str, worth: Worth) -> list[WorthRow]:
     for split in worth.splits:
         stages = [stage for stage in worth.stages if stage.split == split.split]
         first, last = (stages[0], stages[-1]) if stages else (None, None)
-        rows.append(
-            WorthRow(
-                dataset=dataset,
-                environment=worth.environment,
-                root=worth.root[:HEX_DIGITS],
-                split=split.split,
-                tasks=split.tasks,
-                own=split.own,
-                single=split.single,
-                uniform=split.uniform,
-                best=split.best,
-                worth=split.worth,
-                low=split.low,
-                high=split.high,
-                rewarded_first=first.rewarded if first else None,
-                rewarded_last=last.rewarded if last else None,
-                reward_first=first.reward if first else None,
-                reward_last=last.reward if last else None,
-                dynamics_first=first.dynamics if first else None,
-                dynamics_last=last.dynamics if last else None,
-            )
-        )
+        values: dict[str, Any] = {name: getattr(split, name) for name in SPLIT}
+        for when, stage in (("first", first), ("last", last)):
+            for name in ("rewarded", "reward", "dynamics"):
+                values[f"{name}_{when}"] = getattr(stage, name, None)
+        where = (dataset, worth.environment, worth.root[:HEX_DIGITS], split.split)
+        rows.append(WorthRow(*where, **values))
     return rows
 
 
@@ -346,18 +327,6 @@ def _update(kind: type[Row], file: Path, rows: Iterable[Row], key: Callable[[Row
     write_table(kind, file, merged(read_table(kind, file) if file.exists() else [], rows, key))
 
 
-def _run_key(row: RunRow) -> tuple[str, ...]:
-    return (
-        row.experiment,
-        row.environment,
-        row.root,
-        row.method,
-        f"{row.seed:06}",
-        str(row.fold),
-        row.protocol,
-    )
-
-
-def _curve_key(row: CurveRow) -> tuple[str, ...]:
+def _run_key(row: RunRow | CurveRow) -> tuple[str, ...]:
     run = (row.experiment, row.environment, row.root, row.method, f"{row.seed:06}", str(row.fold))
-    return *run, f"{row.step:09}"
+    return *run, row.protocol if isinstance(row, RunRow) else f"{row.step:09}"
