@@ -225,10 +225,8 @@ class LaneRows:
 
     Attributes:
         states, final_states: (lanes, rows, observation_dim), standardised s_t and s_T.
-        actions: (lanes, rows, action_dim).
         returns: (lanes, rows), G_t in units of the largest return.
         discounts: (lanes, rows), gamma^(T - t), 0 where the task ended the episode.
-        mask: (lanes, rows) bool, real transitions.
     """
 
     states: Float[Tensor, "lanes rows observation"]
@@ -292,12 +290,7 @@ def largest_return(problem: Problem, settings: ActorCriticSettings) -> float:
 
 @dataclass(frozen=True)
 class Weighing:
-    """Advantages of actions, in units of the largest return, and how much the actions weigh.
-
-    Attributes:
-        advantages: (lanes, rows).
-        weights: (lanes, rows), positive.
-    """
+    """Advantages of actions, in units of the largest return, and how much the actions weigh."""
 
     advantages: Float[Tensor, "lanes rows"]
     weights: Float[Tensor, "lanes rows"]

@@ -69,9 +69,6 @@ class TaskControls(Frozen):
     """Returns in one test task, all undiscounted means; None for what the environment or dataset lacks.
 
     Attributes:
-        task: index of the task.
-        uniform: of uniform actions.
-        oracle: of a controller that knows the task.
         behavior: of the best of the task's own behavior policies, without their noise.
         behavior_step: training step of that policy.
         fixed_snapshot, fixed_target: of the fixed policies of these names.
@@ -95,13 +92,8 @@ class Controls(Frozen):
     observes what the stored view hides keeps the values of its own task.
 
     Attributes:
-        environment, dataset_root: which dataset this is.
-        splits: split by task.
-        versions: of the packages that the returns depend on.
-        fingerprint: of the environment.
         fixed_snapshot, fixed_target: the fixed policies; None where there are no stored policies or no
             oracle.
-        tasks: the test tasks.
     """
 
     schema_version: Literal[2] = 2

@@ -28,8 +28,6 @@ class TaskResult:
     """Result of a run on one test task; returns are undiscounted sums of rewards.
 
     Attributes:
-        task: index of the task.
-        split: `test`.
         returns: returns of the adaptation episodes, means over the repeats of the protocol.
         final: mean return of the adapted policy.
         finals: the same for every repeat; their spread is that of the protocol's own chance.
@@ -71,9 +69,7 @@ class Evaluation:
     """Result of a run on all test tasks; means are over tasks, and None if a task has no value.
 
     Attributes:
-        algorithm, environment, seed, protocol: which evaluation this is.
         repeats: how many times the protocol was run; 1 unless its first stage is random.
-        tasks: results by test task.
         adaptation_curve: mean returns of the first, second, … adaptation episode: how many episodes it
             takes until the policy is adapted. The episodes are those of the protocol; under `paper` the
             first ones are the method's exploration, uniform actions unless it has one of its own.

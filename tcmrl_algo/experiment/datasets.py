@@ -21,13 +21,7 @@ from tcmrl_data import (
 
 @dataclass(frozen=True)
 class MissingDataset:
-    """A dataset that an experiment needs and that does not exist.
-
-    Attributes:
-        environment: its environment.
-        folder: where the experiment looks for it.
-        profile: with which to build it.
-    """
+    """A dataset that an experiment needs and that does not exist."""
 
     environment: str
     folder: Path

@@ -52,8 +52,6 @@ class CurvePoint(Frozen):
     """One point of a learning curve, and what it took to get there.
 
     Attributes:
-        step: training steps done.
-        stage: of training, at that step.
         final, regret, normalized, shuffled: means over test tasks under the experiment's first protocol; of
             one repeat of it except at the last point, so that evaluation does not outlast training.
         timed_steps, seconds: of training since the last point, as far as this process did it.
@@ -149,9 +147,7 @@ class RunSpec(Frozen):
         experiment, method, environment, seed, profile: which run this is, from whose training table.
         fold: which fold of the tasks is its test split, in an experiment with folds.
         dataset, root: the dataset, by an absolute path, and its Merkle root.
-        device: a torch device.
         identity: everything that the result is a function of, beside code, device and threads.
-        config: the resolved training configuration.
         tuned: where its settings come from, if they were tuned.
     """
 
@@ -206,13 +202,9 @@ class RunResult(RunSpec):
         folder: of the run, with its checkpoints; it may be gone. Not part of the document.
         algorithm, privileged: the method in code; whether it is a control that sees task parameters.
         steps, threads: of training; results depend on threads and device in their last bits.
-        versions: of the packages that results depend on.
-        digest: sha256 over all tensors, by which two runs compare.
-        curve: the learning curve.
         evaluations: by protocol, the documents of `tcmrl evaluate --json`.
         training_seconds: of training alone, scaled up to all steps where a killed process did some of
             them; None where none was timed.
-        evaluation_seconds: of all evaluations.
         peak_memory: bytes, of the process, or of the CUDA device where there is one.
         training_of: `experiment, method` whose training it shares, if it was not trained for this one.
         contexts: what a report measured of its contexts; None before, and without a checkpoint.
@@ -362,8 +354,8 @@ def read_table(kind: type[Row], file: Path) -> list[Row]:
             rows.append(adapter.validate_python(given))
         except ValidationError as error:
             first = error.errors()[0]
-            place = f"{file}, line {reader.line_num}, {first['loc'][0]}"
-            raise CheckpointError(f"{place}: {first['msg']}, not {first['input']!r}") from None
+            problem = f"{first['loc'][0]}: {first['msg']}, not {first['input']!r}"
+            raise CheckpointError(f"{file}, line {reader.line_num}: {problem}") from None
     return rows
 
 

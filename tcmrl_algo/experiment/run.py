@@ -38,12 +38,10 @@ class ExperimentReport:
     """How a call of `run_experiment` ended.
 
     Attributes:
-        out: the results folder.
         results: of all runs that are finished, in the order of the plan.
         present: how many of them were finished before.
         failed: `run: reason` of those that ended in an error.
         diverged: the reason of those whose training diverged, by run.
-        seconds: wall-clock time of this call.
     """
 
     out: Path

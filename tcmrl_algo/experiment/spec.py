@@ -60,7 +60,6 @@ class MethodChoice(Frozen):
     """One `[methods.LABEL]` table.
 
     Attributes:
-        algorithm: a file of `tcmrl_algo/algorithms`.
         training: changes of the training table, after those of the experiment and the environment.
         environments: in which the method is run; all of the experiment's where empty.
     """
@@ -78,7 +77,6 @@ class Claim(Frozen):
     """One `[[claims]]` table: that one quantity is better than another, seed by seed.
 
     Attributes:
-        text: the claim in words.
         better: label of the method that is said to be better.
         worse: label of the method that it is held against; may be the same, with another metric.
         metric: what is compared; a lower regret, time or memory is better, a higher anything else.
@@ -103,17 +101,14 @@ class Experiment(Frozen):
 
     Attributes:
         name: of its results folder.
-        title: one line.
         source: the figure or table of the paper that it stands for.
         seeds: every method is run with every seed.
         folds: into how many folds the tasks of a dataset are cut, each of which is the test split once; the
             dataset's own split where unset. Every method is run with every seed on every fold.
-        environments: by name.
         methods: by label, in the order of tables and figures.
         training: changes of the training table that all runs share.
         protocols: by which trained runs are evaluated; learning curves are by the first.
         curve_points: evenly spaced steps at which a learning curve is evaluated.
-        claims: what the experiment decides.
     """
 
     schema_version: Literal[1] = Field(alias="schema")

@@ -72,11 +72,8 @@ class TuningReport:
     """How a call of `tune_method` ended.
 
     Attributes:
-        out: the folder.
-        tuning: the record of all trials.
         present: how many trials had ended before.
         failed: `run: reason` of runs that crashed; the same call repeats them.
-        seconds: wall-clock time of this call.
     """
 
     out: Path

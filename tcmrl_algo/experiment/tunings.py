@@ -52,10 +52,8 @@ class TrialRun(Frozen):
     """A trial's run with one seed.
 
     Attributes:
-        seed: of the run.
         normalized: mean over the held-out tasks of the normalised return, by protocol.
         final: likewise of the return itself.
-        digest: sha256 over the run's tensors.
     """
 
     seed: int
@@ -74,7 +72,6 @@ class Trial(Frozen):
         runs: one per seed, where the trial ended well.
         score: mean over its runs and protocols of the normalised return; None before the end, and where
             training diverged.
-        error: why it diverged.
     """
 
     number: int
@@ -101,15 +98,11 @@ class Tuning(Frozen):
     Attributes:
         algorithm, environment, profile: what was tuned, from whose training table.
         root: of the dataset; its test tasks were not used.
-        seed: of the proposals.
         seeds: every trial was trained with each.
-        steps: of training.
         protocols: by which trials were scored.
         training_tasks, held_out: the dataset's training tasks that trials were trained on, and scored on.
         space: what was searched, by setting.
         identity: everything that scores are a function of, beside code, device and threads.
-        versions: packages that results depend on.
-        trials: in the order of their numbers.
         best: number of the trial with the highest score, the first one of equals; None without any.
     """
 
@@ -166,9 +159,7 @@ class TrialRow:
         steps, seeds, protocols: every trial was trained so long, with these seeds, and scored by these.
         held_out: the training tasks that trials were scored on.
         trial: number from 0; trial 0 takes the training table as it is.
-        values: the trial's settings, as JSON.
         score: mean normalized return on the held-out tasks; None where training diverged.
-        error: why it diverged.
         best: whether no other score is higher.
     """
 

@@ -51,21 +51,16 @@ class RunRow:
 
     Attributes:
         experiment: name of its results folder.
-        environment: name of the environment.
         dataset_profile: the profile that the dataset was built with.
         behavior_seed: root seed of the dataset.
         root: of the dataset, the first 16 digits. Only rows of one root compare.
         profile: whose training table was the start.
-        method: label.
-        algorithm: name of the method in code.
         privileged: whether the method observes the task parameters.
         actor_critic: what trains the policy: `sac`, `sac+brac`, `sac+cloning`, `iql`, `bc`, or `own`.
         snapshots: which snapshots transitions come from: `all`, `last` or a condition.
         context_snapshots: the same of contexts, where it differs.
         tuned: trials and steps of the search for the settings, and where.
         seed, fold: of the run; no fold where the dataset's own split was used.
-        protocol: of evaluation.
-        test_tasks: their number.
         final: return after adaptation.
         shuffled: return with the contexts of other tasks.
         regret: oracle minus final.
@@ -152,8 +147,6 @@ class WorthRow:
     Attributes:
         dataset: name of the file that it came from.
         environment, root: which dataset.
-        split: `train` or `test`.
-        tasks: number of tasks that took part.
         own, single, uniform, best: returns of the tasks' own last policies, of the best single policy, of
             uniform actions, and the best that is known.
         worth, low, high: what a context can gain, as a share, with its 95% bootstrap interval over tasks.

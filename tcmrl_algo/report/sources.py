@@ -44,8 +44,6 @@ class DatasetReturns(Frozen):
     """`datasets/ENVIRONMENT.json` of a report: what was stored in the dataset of an environment.
 
     Attributes:
-        environment, root, profile: which dataset.
-        train_tasks, test_tasks: number of tasks.
         snapshots: by ascending step, and last all together.
     """
 
@@ -98,7 +96,6 @@ class Contexts:
     Attributes:
         points: contexts by method, (trajectories, latent); methods without contexts are left out.
         labels: task of every context, by method.
-        is_test: whether a task is a test task.
         weights: attention, by method; methods without attention are left out.
     """
 
@@ -113,8 +110,6 @@ class Source:
     """An experiment and its finished runs, ordered by environment, method, fold and seed.
 
     Attributes:
-        experiment: the experiment.
-        runs: its finished runs.
         unfinished: ids of its other runs, with the error of those that failed.
         datasets: returns of the datasets, by environment, as far as they are known.
         contexts: for figures, by environment, as far as checkpoints and datasets are there.

@@ -37,7 +37,6 @@ class Summary:
 
     Attributes:
         values: one per seed, in the order given.
-        mean: of all.
         iqm: interquartile mean, without the lowest and the highest quarter (sizes rounded down).
         low, high: 95% interval of the mean by Student's t, None under FEWEST_SEEDS.
     """
@@ -211,8 +210,6 @@ class Verdict:
     """Verdict on a claim in one environment, under one protocol.
 
     Attributes:
-        claim: text of the claim.
-        environment: name of the environment.
         comparison: the methods and metrics that were compared; privileged methods are marked.
         protocol: of evaluation; None if the metrics do not depend on it.
         pairs: seed and fold of the runs that both methods have; the fold is None without folds.

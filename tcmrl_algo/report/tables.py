@@ -20,13 +20,7 @@ PARTS = ("final", "shuffled", "regret", "normalized", "fixed")
 
 @dataclass(frozen=True)
 class Table:
-    """A named table; None is a missing value.
-
-    Attributes:
-        name: name of the CSV file.
-        columns: headings.
-        rows: cells of the rows, one per column.
-    """
+    """A named table; None is a missing value."""
 
     name: str
     columns: tuple[str, ...]

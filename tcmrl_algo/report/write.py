@@ -77,13 +77,7 @@ ratios of the rows."""
 
 @dataclass(frozen=True)
 class WrittenReport:
-    """Files and verdicts of a report.
-
-    Attributes:
-        report: the Markdown file.
-        files: all files, including `report`.
-        verdicts: verdicts on the claims of the experiments.
-    """
+    """Files and verdicts of a report."""
 
     report: Path
     files: tuple[Path, ...]

@@ -30,18 +30,11 @@ class RunRecord(Frozen):
     """`run.json`: everything a run is a function of, beside the code.
 
     Attributes:
-        schema_version: of this file.
-        environment: the environment's name.
-        dataset: where the dataset lay.
         root: the dataset's root, which its content determines.
         profile: whose training table was resolved.
         seed: of everything random.
         steps: how far to train.
-        device: where.
-        config: the resolved configuration.
         privileged: whether the method is a control that sees task parameters.
-        moments: statistics of the data trained on.
-        versions: packages that results depend on.
     """
 
     schema_version: Literal[1] = 1
@@ -72,12 +65,7 @@ class CheckpointRecord(Frozen):
 @final
 @dataclass(frozen=True)
 class Checkpoint:
-    """A published checkpoint.
-
-    Attributes:
-        folder: where it lies.
-        step: training steps done.
-    """
+    """A published checkpoint."""
 
     folder: Path
     step: int
@@ -102,12 +90,7 @@ class Checkpoint:
 @final
 @dataclass(frozen=True)
 class Run:
-    """A run's folder.
-
-    Attributes:
-        folder: where it lies.
-        record: its `run.json`.
-    """
+    """A run's folder."""
 
     folder: Path
     record: RunRecord

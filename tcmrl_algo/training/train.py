@@ -141,12 +141,9 @@ class TrainingProgress:
     """Where a training run stands.
 
     Attributes:
-        step: steps done.
-        steps: steps to do.
         stage: of training, to which the step belongs.
         rate: steps per second since the last report.
         data_share: share of that time spent waiting for batches.
-        metrics: of that step.
         watched: the last `watch/return`, if a watch looks at the run.
     """
 
@@ -164,8 +161,6 @@ class TrainingReport:
     """The result of a finished training run.
 
     Attributes:
-        run: its folder and record.
-        step: steps done.
         seconds: wall-clock time of this call.
         digest: sha256 over all tensors, by which two runs compare.
     """

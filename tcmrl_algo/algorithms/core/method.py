@@ -97,10 +97,6 @@ class Algorithm(abc.ABC):
         parts: what a stage trains, as of `StagedOptimizer`.
         groups: learning rates and bounds of their own, as of `StagedOptimizer`.
         optimizers: those that the method steps itself within `loss`, by name; checkpoints hold them too.
-
-    Attributes:
-        problem: as above.
-        networks: as above.
     """
 
     def __init__(

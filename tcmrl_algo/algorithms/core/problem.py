@@ -30,8 +30,6 @@ class Stage:
 
     Attributes:
         name: unique within a method.
-        steps: how many training steps it lasts.
-        request: what its batches hold.
     """
 
     name: str
@@ -43,9 +41,7 @@ class StagePosition(NamedTuple):
     """Where a training step lies.
 
     Attributes:
-        stage: name of its stage.
         step: its number within the stage, from 1.
-        steps: how many steps the stage has.
     """
 
     stage: str
@@ -101,12 +97,10 @@ class Problem:
         reward_mean, reward_std: of single steps.
         reward_range: lowest and highest reward of a step.
         dense_reward_range: those of dense rewards, if the actor-critic learns from them; else None.
-        seed: the run's.
         stages: of training; schedules stretch over them.
         training_tasks: indices of the training tasks, ascending.
         privileged: (training tasks, parameters), standardised task parameters in the order of
             `training_tasks`; None for methods without that capability.
-        device: where networks live.
     """
 
     environment: str

@@ -90,7 +90,6 @@ class PolicyActions:
     """Actions drawn from the policy.
 
     Attributes:
-        actions: (rows, action_dim) in (-1, 1).
         log_probabilities: (rows,), of the squashed actions.
         mean: (rows, action_dim), before squashing.
         log_std: (rows, action_dim), before squashing.
