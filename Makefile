@@ -46,7 +46,7 @@ demo: $(INSTALLED)
 	$(BIN)/tcmrl-data build point-robot --profile quick --seed $(SEED) --out $(DATA)
 	$(BIN)/tcmrl-data inspect returns $(DATA) --plot $(DATA)-returns.png
 	@rm -rf $(RUN)
-	$(BIN)/tcmrl train $(DATA) --seed $(SEED) --out $(RUN)
+	$(BIN)/tcmrl train $(DATA) --seed $(SEED) --set run.steps=3000 --out $(RUN)
 	$(BIN)/tcmrl evaluate $(RUN) --protocol all
 	@echo "Next: $(BIN)/tcmrl experiment tour --data $(DATA)"
 
