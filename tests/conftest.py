@@ -18,6 +18,7 @@ import tcmrl_data
 from tcmrl_data import Dataset, Recipe
 from tcmrl_data.engine.local import InProcessEngine, LocalEngine
 from tests import commands
+from tests.commands import Call
 from tests.namespace import has_only_loopback
 from tests.workers import MARK, ROOT
 
@@ -114,6 +115,14 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     `tests/test_engines.py` holds that both engines give the same.
     """
     monkeypatch.setattr(LocalEngine, "run", InProcessEngine.run)
+
+
+@pytest.fixture
+def call(capsys: pytest.CaptureFixture[str]) -> Call:
+    """Runs `tcmrl`; tests of `tcmrl-data` have a fixture of their own under this name."""
+    from tcmrl_cli.train import tcmrl
+
+    return commands.in_process(tcmrl, capsys)
 
 
 @pytest.fixture(scope="module")

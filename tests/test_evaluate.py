@@ -22,7 +22,7 @@ from tcmrl_data import (
     Trajectory,
 )
 from tests.adapters import oracle
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 from tests.environments import environment_of
 from tests.plugin_packages import install
 from tests.terminal import as_in_terminal, assert_fits
@@ -171,11 +171,6 @@ def test_a_run_without_checkpoint_cannot_be_evaluated(trained: Path, tmp_path: P
     shutil.rmtree(copied / "checkpoints")
     with pytest.raises(CheckpointError, match="no checkpoint"):
         evaluate_run(copied)
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(tcmrl, capsys)
 
 
 def test_evaluate_command_prints_the_documented_json(trained: Path, call: Call) -> None:

@@ -24,7 +24,7 @@ from tcmrl_data import SelectionError, TcmrlError, TrainingError
 from tcmrl_data.foundation.machine import available_cores, processor
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 from tests.directed import EXPERIMENT, Directions
 from tests.terminal import as_in_terminal, assert_fits
 from tests.workers import PATIENCE, command_line, marked_pids, wait_for
@@ -32,11 +32,6 @@ from tests.workers import PATIENCE, command_line, marked_pids, wait_for
 CLAIM = {"text": "TCMRL ends higher", "better": "TCMRL", "worse": "no context"}
 PARTS = ("final", "shuffled", "regret")
 FILES = {f"point-robot--{method}--seed{seed}" for method in ("tcmrl", "no-context") for seed in (0, 1)}
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(tcmrl, capsys)
 
 
 @pytest.fixture(scope="module")

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import load_experiment, run_experiment, write_report
@@ -18,15 +17,10 @@ from tcmrl_algo.experiment.spec import Experiment, read_experiment
 from tcmrl_data import SelectionError, TrainingError
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 from tests.conftest import TINY
 
 pytestmark = pytest.mark.usefixtures("in_process")
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(tcmrl, capsys)
 
 
 def _small(dataset: Path, **changes: Any) -> Experiment:

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import WrittenReport, open_run, run_experiment, write_report
@@ -39,14 +38,9 @@ from tcmrl_algo.report.write import compose, measure_paths
 from tcmrl_data import Dataset
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 
 PNG = b"\x89PNG"
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(tcmrl, capsys)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from tcmrl_algo.evaluation.arena import Arena
 from tcmrl_algo.training.checkpoint import list_runs
 from tcmrl_algo.training.train import TrainingProgress
 from tcmrl_data import CheckpointError, Dataset, SelectionError, Task, TrainingError
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 from tests.datasets import with_tasks
 from tests.small_training import SMALL, config_of
 from tests.terminal import as_in_terminal
@@ -35,11 +35,6 @@ def start(tiny: Dataset, tmp_path: Path) -> Train:
         return train_run(tiny, tmp_path / name, config=config, profile="quick", **more)
 
     return start
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(tcmrl, capsys)
 
 
 @pytest.mark.parametrize("algorithm", METHODS.names())

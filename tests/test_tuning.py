@@ -9,7 +9,6 @@ from statistics import fmean
 from typing import Any
 
 import pytest
-from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import (
@@ -38,7 +37,7 @@ from tcmrl_data import Dataset, SelectionError, TrainingError
 from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.errors import CheckpointError, MissingPackageError
 from tcmrl_data.store.part import References
-from tests.commands import Call, assert_refused, in_process
+from tests.commands import Call, assert_refused
 from tests.experiments import SMALL
 from tests.graded import graded_dataset
 
@@ -53,11 +52,6 @@ SPACE = {
     "optimizer.learning_rate": Dimension(kind="factors", own=1e-3, low=0.1, high=10.0),
     "tcmrl.weights.distance": Dimension(kind="options", own=0.1, options=(0.0, 0.1, 1.0)),
 }
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    return in_process(tcmrl, capsys)
 
 
 def without_test_parts(folder: Path) -> Path:
