@@ -1,6 +1,11 @@
 """Training settings that make a run take seconds."""
 
+import torch
+
 from tcmrl_algo import TrainingConfig, resolve
+from tcmrl_algo.algorithms.core.problem import StagePlan
+from tcmrl_algo.algorithms.core.settings import RunSettings
+from tcmrl_algo.training.batches import StagedBatches, open_batches
 from tcmrl_data import Dataset
 
 SMALL = (
@@ -18,3 +23,9 @@ SMALL = (
 def config_of(dataset: Dataset, *overrides: str, algorithm: str | None = None) -> TrainingConfig:
     table = dataset.manifest.training["quick"]
     return resolve(table, place="quick", algorithm=algorithm, overrides=(*SMALL, *overrides))
+
+
+def small_batches(dataset: Dataset, run: RunSettings, stages: StagePlan) -> StagedBatches:
+    """The batches of a run on the CPU, from memory."""
+    device = torch.device("cpu")
+    return open_batches(dataset, run, stages, seed=0, device=device, memory_limit=None, say=lambda _: None)

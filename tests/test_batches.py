@@ -8,7 +8,7 @@ import torch
 from tcmrl_algo import resolve
 from tcmrl_algo.algorithms.core.problem import Stage, StagePlan
 from tcmrl_algo.algorithms.core.settings import RunSettings
-from tcmrl_algo.training.batches import JoinedBatches, StagedBatches, open_batches, split_request
+from tcmrl_algo.training.batches import JoinedBatches, StagedBatches, split_request
 from tcmrl_algo.training.config import stage_plan
 from tcmrl_data import (
     BatchRequest,
@@ -19,20 +19,13 @@ from tcmrl_data import (
     Windows,
     open_sampler,
 )
+from tests.small_training import small_batches
 
 
 def open_with(dataset: Dataset, *overrides: str, algorithm: str = "tcmrl") -> StagedBatches:
     table = dataset.manifest.training["quick"]
     config = resolve(table, place="quick", algorithm=algorithm, overrides=overrides)
-    return open_batches(
-        dataset,
-        config.settings.run,
-        stage_plan(config),
-        seed=0,
-        device=torch.device("cpu"),
-        memory_limit=None,
-        say=lambda message: None,
-    )
+    return small_batches(dataset, config.settings.run, stage_plan(config))
 
 
 def test_joined_batches_take_each_kind_from_its_selection(tiny: Dataset) -> None:
@@ -98,15 +91,7 @@ def test_every_stage_gets_what_it_requests_of_one_stream(
     run = RunSettings(context_snapshots=context_snapshots)
 
     def opened(chosen: list[Stage]) -> StagedBatches:
-        return open_batches(
-            tiny,
-            run,
-            StagePlan(chosen, steps=2 * len(chosen)),
-            seed=0,
-            device=torch.device("cpu"),
-            memory_limit=None,
-            say=lambda message: None,
-        )
+        return small_batches(tiny, run, StagePlan(chosen, steps=2 * len(chosen)))
 
     staged, whole = opened(stages), opened(stages[2:])
     names = [["rows"], ["rows"], ["episodes"], ["episodes"], ["rows", "episodes"], ["rows", "episodes"]]

@@ -18,7 +18,6 @@ from tcmrl_algo.algorithms.corro import (
     outcome_error,
     relabelled_contrastive_loss,
 )
-from tcmrl_algo.training.batches import open_batches
 from tcmrl_data import Batch, Dataset, Steps, TrainingError
 from tests.context_learners import algorithm_of, gradients, learner_of, losses_of, moved
 from tests.made_up import (
@@ -33,6 +32,7 @@ from tests.made_up import (
     trajectory,
     with_steps,
 )
+from tests.small_training import small_batches
 
 SMALL: dict[str, Any] = {"latent": 4, "encoder_hidden": (8,), "cvae_latent": 3, "cvae_hidden": (8,)}
 PARTS = ("encoder", "aggregator", "cvae")
@@ -288,15 +288,7 @@ def test_reports_know_its_attention() -> None:
 def test_all_stages_read_training_tasks_alone(tiny: Dataset) -> None:
     """The published code trains the VAE on test tasks too."""
     stages = stages_of(steps=10)
-    batches = open_batches(
-        tiny,
-        RunSettings(steps=10, context_snapshots="last"),
-        stages,
-        seed=0,
-        device=torch.device("cpu"),
-        memory_limit=None,
-        say=lambda message: None,
-    )
+    batches = small_batches(tiny, RunSettings(steps=10, context_snapshots="last"), stages)
     known = {task.index for task in tiny.train_tasks}
     assert known != {task.index for task in tiny.tasks}
     names = []

@@ -11,7 +11,6 @@ from tcmrl_algo import METHODS, TrainingSettings, resolve, train_run
 from tcmrl_algo.algorithms.core.actor_critic.base import value_bounds
 from tcmrl_algo.algorithms.core.problem import Stage, StagePlan
 from tcmrl_algo.algorithms.core.settings import RunSettings
-from tcmrl_algo.training.batches import open_batches
 from tcmrl_data import (
     BatchRequest,
     Dataset,
@@ -36,6 +35,7 @@ from tests.environments import environment_of, episodes, parameters_of
 from tests.graded import graded_dataset
 from tests.made_up import problem, settings
 from tests.sampling import numbered_tasks, sampler_of
+from tests.small_training import small_batches
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
@@ -152,15 +152,7 @@ def test_the_cache_holds_both_kinds_of_rows(
 def test_a_later_stage_may_take_dense_rewards(dataset: Dataset, context_snapshots: str | None) -> None:
     kinds = [OTHERS, {"policy": Transitions(8, rewards="dense")}, {"policy": Transitions(8)}]
     stages = StagePlan([Stage(str(n), 1, BatchRequest(3, kind)) for n, kind in enumerate(kinds)], steps=3)
-    batches = open_batches(
-        dataset,
-        RunSettings(context_snapshots=context_snapshots),
-        stages,
-        seed=0,
-        device=torch.device("cpu"),
-        memory_limit=None,
-        say=lambda message: None,
-    )
+    batches = small_batches(dataset, RunSettings(context_snapshots=context_snapshots), stages)
     assert batches.batch(0).names() == list(OTHERS)
     assert (batches.batch(1)["policy"].rewards < 0).all()
     assert batches.batch(2)["policy"].rewards.mean() > 0
