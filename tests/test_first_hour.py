@@ -20,7 +20,7 @@ from tcmrl_cli.train import tcmrl
 import tcmrl_data
 from tcmrl_algo import train_run
 from tcmrl_algo.algorithms.core.settings import RunSettings
-from tcmrl_algo.evaluation.evaluate import FinalEpisodes, PathPlot
+from tcmrl_algo.evaluation.evaluate import draw_paths
 from tcmrl_data import BuildReport, Dataset, list_datasets, open_dataset
 from tcmrl_data.foundation.disk import disk, named_errors
 from tcmrl_data.foundation.errors import BuildError, SelectionError, StorageError
@@ -234,7 +234,7 @@ def test_titles_of_paths_do_not_touch(
     (episode, *_) = graded.trajectories(0, graded.parts.keys_of(0)[-1].step)
     path = replace(episode, observations=np.linspace((0.0, -end), (1.0, 1.0), len(episode.observations)))
     episodes = {task.index: [path] for task in graded.test_tasks}
-    PathPlot(tmp_path / "x.png", graded, RunSettings())(FinalEpisodes(episodes, episodes))
+    draw_paths(tmp_path / "x.png", graded, RunSettings(), episodes, episodes)
     (figure,) = figures
     figure.draw_without_rendering()
     assert figure.texts[0].get_window_extent().y0 > max(axes.get_tightbbox().y1 for axes in figure.axes)
