@@ -18,7 +18,6 @@ import tcmrl_data
 from tcmrl_data import Dataset, Recipe
 from tcmrl_data.engine.local import InProcessEngine, LocalEngine
 from tests import commands
-from tests.commands import Call
 from tests.namespace import has_only_loopback
 from tests.workers import MARK, ROOT
 
@@ -101,11 +100,11 @@ def own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 
 @pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> commands.Call:
-    """Runs `tcmrl-data` in this process."""
+def call(request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]) -> commands.Call:
+    """Runs `tcmrl-data` in this process, or the program that the module names as `PROGRAM`."""
     from tcmrl_cli.data import data
 
-    return commands.in_process(data, capsys)
+    return commands.in_process(getattr(request.module, "PROGRAM", data), capsys)
 
 
 @pytest.fixture
@@ -115,14 +114,6 @@ def in_process(monkeypatch: pytest.MonkeyPatch) -> None:
     `tests/test_engines.py` holds that both engines give the same.
     """
     monkeypatch.setattr(LocalEngine, "run", InProcessEngine.run)
-
-
-@pytest.fixture
-def call(capsys: pytest.CaptureFixture[str]) -> Call:
-    """Runs `tcmrl`; tests of `tcmrl-data` have a fixture of their own under this name."""
-    from tcmrl_cli.train import tcmrl
-
-    return commands.in_process(tcmrl, capsys)
 
 
 @pytest.fixture(scope="module")

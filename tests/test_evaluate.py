@@ -285,6 +285,8 @@ def test_one_protocol_shows_its_tasks_and_their_mean(trained: Path, call: Call) 
 PLUGIN = """
 from tcmrl_algo import Adaptation, Protocol
 
+PROGRAM = tcmrl
+
 class Plugin(Protocol):
     name = "borrowed"
 

@@ -29,6 +29,8 @@ from tests.directed import EXPERIMENT, Directions
 from tests.terminal import as_in_terminal, assert_fits
 from tests.workers import PATIENCE, command_line, marked_pids, wait_for
 
+PROGRAM = tcmrl
+
 CLAIM = {"text": "TCMRL ends higher", "better": "TCMRL", "worse": "no context"}
 PARTS = ("final", "shuffled", "regret")
 FILES = {f"point-robot--{method}--seed{seed}" for method in ("tcmrl", "no-context") for seed in (0, 1)}

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import load_experiment, run_experiment, write_report
@@ -19,6 +20,8 @@ from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused
 from tests.conftest import TINY
+
+PROGRAM = tcmrl
 
 pytestmark = pytest.mark.usefixtures("in_process")
 

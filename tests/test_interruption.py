@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import open_run, resume_run, train_run
 from tcmrl_algo.training.train import TrainingProgress
@@ -16,6 +17,8 @@ from tcmrl_data import Dataset
 from tests.commands import Call, assert_refused
 from tests.small_training import SMALL, config_of
 from tests.workers import PATIENCE, command_line, wait_for
+
+PROGRAM = tcmrl
 
 SETTINGS = [argument for text in SMALL for argument in ("--set", text)]
 

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import WrittenReport, open_run, run_experiment, write_report
@@ -39,6 +40,8 @@ from tcmrl_data import Dataset
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
 from tests.commands import Call, assert_refused
+
+PROGRAM = tcmrl
 
 PNG = b"\x89PNG"
 

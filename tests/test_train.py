@@ -23,6 +23,8 @@ from tests.datasets import with_tasks
 from tests.small_training import SMALL, config_of
 from tests.terminal import as_in_terminal
 
+PROGRAM = tcmrl
+
 Train = Callable[..., tcmrl_algo.TrainingReport]
 
 

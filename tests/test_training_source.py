@@ -5,11 +5,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from tcmrl_cli.train import tcmrl
 
 from tcmrl_algo import open_run, resolve_for
 from tcmrl_data import load_recipe, open_dataset
 from tcmrl_data.foundation.records import sealed
 from tests.commands import Call
+
+PROGRAM = tcmrl
 
 STEPS = "run.steps=2"
 

@@ -9,6 +9,7 @@ from statistics import fmean
 from typing import Any
 
 import pytest
+from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
 from tcmrl_algo import (
@@ -40,6 +41,8 @@ from tcmrl_data.store.part import References
 from tests.commands import Call, assert_refused
 from tests.experiments import SMALL
 from tests.graded import graded_dataset
+
+PROGRAM = tcmrl
 
 pytest.importorskip("optuna")
 
