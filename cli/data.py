@@ -14,11 +14,11 @@ from .changing import derive, extend, merge, relabel
 from .frame import (
     duration,
     main_program,
-    make_table,
     next_commands,
     output_options,
     print_json,
-    print_table,
+    print_properties,
+    print_rows,
     remark,
 )
 from .groups import SETTINGS, Commands
@@ -80,10 +80,8 @@ def envs(as_json: bool) -> None:
         "train": "train",
         "test": "test",
     }
-    table = make_table("Environments", columns=heads.values(), text=["environment"])
-    for row in found.environments:
-        table.add_row(*(str(row[key]) for key in heads))
-    print_table(table)
+    rows = [[str(row[key]) for key in heads] for row in found.environments]
+    print_rows("Environments", heads.values(), rows, text=["environment"])
     for error in found.broken.values():
         click.echo(f"broken: {error}")
 
@@ -113,28 +111,24 @@ def list_(folder: Path | str | None, as_json: bool) -> None:
     if not rows:
         remark(f"no datasets in {folder}; build one with `tcmrl-data build ENV`")
         return
-    table = make_table(
+    print_rows(
         f"Datasets in {folder}",
-        columns=["dataset", "contents", "tasks", "parts", "root"],
+        ["dataset", "contents", "tasks", "parts", "root"],
+        map(_cells, rows),
         text=["root"],
         long_text=["dataset", "contents"],
     )
-    for row in rows:
-        if "error" in row:
-            table.add_row(row["path"], f"unreadable: {row['error']}", "", "", "")
-            continue
-        table.add_row(
-            row["path"], printable(_contents(row)), f"{row['tasks']:,}", f"{row['parts']:,}", row["root"][:12]
-        )
-    print_table(table)
 
 
-def _contents(row: dict[str, Any]) -> str:
-    """What a dataset is called, what it was made by, and its state."""
+def _cells(row: dict[str, Any]) -> tuple[str, ...]:
+    """A dataset's folder, what it is called and was made by, its state and its sizes."""
+    if "error" in row:
+        return row["path"], f"unreadable: {row['error']}"
     made = [row["label"], row["name"], row["profile"], row["behavior"], f"seed {row['seed']}"]
     view = f"view of {row['source']}" if row["source"] else None
     state = "complete" if row["complete"] else "incomplete"
-    return ", ".join(filter(None, [*made, row["derived"], view, state]))
+    contents = printable(", ".join(filter(None, [*made, row["derived"], view, state])))
+    return row["path"], contents, f"{row['tasks']:,}", f"{row['parts']:,}", row["root"][:12]
 
 
 @click.command()
@@ -159,14 +153,11 @@ def show(dataset: Path, as_json: bool) -> None:
     if as_json:
         print_json(document | {"build": None if status is None else dataclasses.asdict(status)})
         return
-    title = printable(str(opened.path))
-    table = make_table(title, columns=["property", "value"], text=["property"], long_text=["value"])
     rows = _summary(document)
     if status is not None and (status.builder or not document["complete"] or status.num_failed):
         rows |= _progress(status)
-    for name, value in rows.items():
-        table.add_row(name, printable(value))
-    print_table(table)
+    values = {name: printable(value) for name, value in rows.items()}
+    print_properties(printable(str(opened.path)), values)
     place = str(opened.path)
     if not document["complete"]:
         remark(f"Next: run the `tcmrl-data build {document['name']}` command of this dataset again")

@@ -18,6 +18,7 @@ from .frame import (
     number,
     output_options,
     print_json,
+    print_rows,
     print_table,
     remark,
     same_command,
@@ -207,14 +208,11 @@ def _print_list(*, as_json: bool) -> None:
             {"experiments": [experiment.model_dump(mode="json", include=fields) for experiment in found]}
         )
         return
-    table = make_table(
-        "Experiments", columns=["experiment", "title", "runs"], text=["experiment"], long_text=["title"]
-    )
-    for experiment in found:
-        num_runs = len(experiment.environments) * len(experiment.methods) * len(experiment.seeds)
-        num_runs *= len(experiment.fold_numbers)
-        table.add_row(experiment.name, experiment.title, str(num_runs))
-    print_table(table)
+    rows = []
+    for one in found:
+        num_runs = len(one.environments) * len(one.methods) * len(one.seeds) * len(one.fold_numbers)
+        rows.append((one.name, one.title, str(num_runs)))
+    print_rows("Experiments", ["experiment", "title", "runs"], rows, text=["experiment"], long_text=["title"])
 
 
 def _run_line(result: "RunResult | str", done: int, total: int, seconds_left: float | None) -> str:

@@ -9,7 +9,7 @@ import shutil
 import signal
 import sys
 import textwrap
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
@@ -230,6 +230,26 @@ def make_table(
         else:
             table.add_column(column, justify="left" if column in texts else "right", no_wrap=True)
     return table
+
+
+def print_rows(
+    title: str,
+    columns: Iterable[str],
+    rows: Iterable[Iterable[str]],
+    *,
+    text: Iterable[str] = (),
+    long_text: Iterable[str] = (),
+) -> None:
+    """Prints a table of `make_table` with these rows; a shorter row leaves the last cells empty."""
+    table = make_table(title, columns=columns, text=text, long_text=long_text)
+    for row in rows:
+        table.add_row(*row)
+    print_table(table)
+
+
+def print_properties(title: str, properties: Mapping[str, str]) -> None:
+    """Prints a table of names and values, which may be long."""
+    print_rows(title, ["property", "value"], properties.items(), text=["property"], long_text=["value"])
 
 
 def remark(message: str) -> None:

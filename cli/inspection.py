@@ -4,17 +4,21 @@ import json
 import math
 import shlex
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
-from .frame import fail_incomplete, make_table, number, output_options, print_json, print_table, remark
+from .frame import (
+    fail_incomplete,
+    number,
+    output_options,
+    print_json,
+    print_rows,
+    remark,
+)
 from .groups import Commands
 from .measures import coverage, quality, rewards, transfer, worth
 from .options import DATASET, INDEX, PLOT
-
-if TYPE_CHECKING:
-    pass
 
 SHIFTS_SHOWN = 8
 """Parameters whose shift is printed; a walker has more than fifty."""
@@ -71,23 +75,15 @@ def returns(dataset: Path, as_json: bool, plot: Path | None, recompute: bool) ->
 def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:
     with_success = any(row["success_rate"] is not None for row in rows)
     columns = ["step", "split", "tasks", "episodes", "mean", "std", "min", "max"]
-    table = make_table(
-        f"{name}: mean return of a task, over tasks",
-        columns=columns + ["success"] * with_success,
-        text=["split"],
-    )
+    cells = []
     for previous, row in zip([None, *rows], rows, strict=False):
         repeated = previous is not None and previous["step"] == row["step"]
         success = [f"{row['success_rate']:.0%}"] if row["success_rate"] is not None else []
-        table.add_row(
-            "" if repeated else f"{row['step']:,}",
-            row["split"],
-            str(row["tasks"]),
-            f"{row['episodes']:,}",
-            *(number(row[key]) for key in ("mean", "std", "min", "max")),
-            *success,
-        )
-    print_table(table)
+        values = (number(row[key]) for key in ("mean", "std", "min", "max"))
+        counts = (str(row["tasks"]), f"{row['episodes']:,}")
+        cells.append(("" if repeated else f"{row['step']:,}", row["split"], *counts, *values, *success))
+    heading = f"{name}: mean return of a task, over tasks"
+    print_rows(heading, columns + ["success"] * with_success, cells, text=["split"])
 
 
 @click.command()
@@ -111,17 +107,13 @@ def tasks(dataset: Path, as_json: bool) -> None:
         print_json(document)
         return
     references = ["uniform", "oracle", "scripted", "behavior"]
-    table = make_table(
-        f"{document['name']}: tasks",
-        columns=["task", "split", "parameters", *references],
-        text=["split"],
-        long_text=["parameters"],
-    )
+    rows = []
     for row in document["tasks"]:
         known = row["references"] or dict.fromkeys(references)
         values = (number(known[reference]) for reference in references)
-        table.add_row(str(row["task"]), row["split"], _shortened(row["parameters"]), *values)
-    print_table(table)
+        rows.append((str(row["task"]), row["split"], _shortened(row["parameters"]), *values))
+    columns = ["task", "split", "parameters", *references]
+    print_rows(f"{document['name']}: tasks", columns, rows, text=["split"], long_text=["parameters"])
     _print_shift(document)
 
 
@@ -131,14 +123,12 @@ def _print_shift(document: dict[str, Any]) -> None:
     if not rows:
         return
     columns = ["train", "test", "difference", "standardized"]
-    table = make_table(
+    print_rows(
         f"{document['name']}: means of training and test tasks",
-        columns=["parameter", *columns],
+        ["parameter", *columns],
+        [(row["parameter"], *(number(row[name]) for name in columns)) for row in rows[:SHIFTS_SHOWN]],
         text=["parameter"],
     )
-    for row in rows[:SHIFTS_SHOWN]:
-        table.add_row(row["parameter"], *(number(row[column]) for column in columns))
-    print_table(table)
     if len(rows) > SHIFTS_SHOWN:
         remark(f"{len(rows) - SHIFTS_SHOWN} more parameters differ less; --json has all")
 
@@ -165,11 +155,11 @@ def snapshots(dataset: Path, as_json: bool) -> None:
         print_json(document)
         return
     columns = ["task", "split", "step", "id", "episodes", "steps", "mean return"]
-    table = make_table(f"{document['name']}: snapshots", columns=columns, text=["split", "id"])
+    rows = []
     for row in document["snapshots"]:
         counts = (f"{row['episodes']:,}", f"{row['steps']:,}", number(row["mean"]))
-        table.add_row(str(row["task"]), row["split"], f"{row['step']:,}", row["id"][:12], *counts)
-    print_table(table)
+        rows.append((str(row["task"]), row["split"], f"{row['step']:,}", row["id"][:12], *counts))
+    print_rows(f"{document['name']}: snapshots", columns, rows, text=["split", "id"])
 
 
 @click.command()
@@ -192,19 +182,13 @@ def episodes(dataset: Path, as_json: bool, task: int | None, step: int | None) -
         print_json(document)
         return
     columns = ["task", "step", "episode", "length", "return", "ended", "success"]
-    table = make_table(f"{document['name']}: episodes", columns=columns, text=["ended", "success"])
+    rows = []
     for row in document["episodes"]:
         success = "–" if row["success"] is None else "yes" if row["success"] else "no"
-        table.add_row(
-            str(row["task"]),
-            f"{row['step']:,}",
-            str(row["episode"]),
-            str(row["length"]),
-            number(row["return"]),
-            "terminated" if row["terminated"] else "truncated" if row["truncated"] else "–",
-            success,
-        )
-    print_table(table)
+        ended = "terminated" if row["terminated"] else "truncated" if row["truncated"] else "–"
+        counts = (str(row["task"]), f"{row['step']:,}", str(row["episode"]), str(row["length"]))
+        rows.append((*counts, number(row["return"]), ended, success))
+    print_rows(f"{document['name']}: episodes", columns, rows, text=["ended", "success"])
 
 
 def _shortened(parameters: dict[str, Any]) -> str:

@@ -13,7 +13,7 @@ import click
 from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
 
-from .frame import duration, fail_incomplete, make_table, output_options, print_json, print_table, remark
+from .frame import duration, fail_incomplete, output_options, print_json, print_rows, remark
 from .groups import Commands
 from .options import COUNT, DATASET, DRY_RUN, INDEX, PATH, WORKERS, allow_only
 from .progress import StageProgress
@@ -319,23 +319,14 @@ def list_cache(as_json: bool) -> None:
         return
     total = sum(entry.bytes for entry in entries)
     title = f"{folder}: {size(total)} of {size(limit)}"
-    table = make_table(
-        title, columns=["key", "environment", "dataset", "tasks", "parts", "size", "used", "state"],
-        text=["key", "environment", "dataset", "used", "state"],
-    )  # fmt: skip
+    texts, counts = ["key", "environment", "dataset", "used", "state"], ["tasks", "parts", "size"]
+    cells = []
     for entry in entries:
         used = datetime.datetime.fromtimestamp(entry.used).isoformat(" ", "minutes")
-        table.add_row(
-            entry.key[:12],
-            entry.environment,
-            entry.dataset,
-            str(entry.tasks),
-            str(entry.parts),
-            size(entry.bytes),
-            used,
-            "in use" if entry.in_use else "",
-        )
-    print_table(table)
+        numbers = (str(entry.tasks), str(entry.parts), size(entry.bytes))
+        state = "in use" if entry.in_use else ""
+        cells.append((entry.key[:12], entry.environment, entry.dataset, *numbers, used, state))
+    print_rows(title, [*texts[:3], *counts, *texts[3:]], cells, text=texts)
 
 
 @click.command(name="verify")

@@ -23,6 +23,7 @@ from .frame import (
     make_table,
     output_options,
     print_json,
+    print_properties,
     print_table,
     remark,
     same_command,
@@ -262,7 +263,6 @@ def _print_plan(plan: "BuildPlan", *, workers: int | None, as_json: bool) -> Non
         print_json(dataclasses.asdict(planned))
         return
     title = f"Plan: {planned.environment}, profile {planned.profile}"
-    table = make_table(title, columns=["property", "value"], text=["property"], long_text=["value"])
     rows = {
         "behavior": planned.behavior,
         "tasks": f"{planned.tasks:,} ({planned.train:,} train, {planned.test:,} test)",
@@ -275,9 +275,7 @@ def _print_plan(plan: "BuildPlan", *, workers: int | None, as_json: bool) -> Non
         "time": f"about {duration(planned.seconds)} ({duration(planned.seconds_low)} to "
         f"{duration(planned.seconds_high)}) with {planned.workers} workers",
     }
-    for name, value in rows.items():
-        table.add_row(name, value)
-    print_table(table)
+    print_properties(title, rows)
     if busy > BUSY_SHARE * cores:
         remark(f"This machine is busy: {busy:.1f} processes on {cores} cores; the time is that beside them.")
 

@@ -1,18 +1,17 @@
 """`tcmrl-data inspect quality|coverage|rewards|transfer|worth`: measures of a dataset."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, TypeVar
 
 import click
 
 from .frame import (
-    make_table,
     number,
     output_options,
     print_json,
-    print_table,
+    print_rows,
     remark,
     stopped_by_signals,
     typed_command,
@@ -27,6 +26,7 @@ if TYPE_CHECKING:
     from tcmrl_data.quality.scores import StageQuality
 
 Found = TypeVar("Found", bound="Measured")
+Row = TypeVar("Row", bound="Stage")
 Report = Callable[[str], PartsProgress]
 """Takes the name of a stage and gives what reports its progress."""
 
@@ -82,10 +82,20 @@ def title(found: "Measured") -> str:
     return found.label or found.environment
 
 
-def stage_cells(previous: Stage | None, stage: Stage) -> tuple[str, str]:
-    """Step and split of a row; a step that the row before has too is left out."""
-    is_repeated = previous is not None and previous.step == stage.step
-    return "" if is_repeated else f"{stage.step:,}", stage.split
+def _print_stages(
+    heading: str,
+    columns: Sequence[str],
+    stages: Sequence[Row],
+    cells: Callable[[Row], Iterable[str]],
+    *,
+    long_text: Sequence[str] = (),
+) -> None:
+    """Prints a table of cells by step and split; a step that the row before has too is left out."""
+    rows = []
+    for place, stage in enumerate(stages):
+        is_repeated = place > 0 and stages[place - 1].step == stage.step
+        rows.append(("" if is_repeated else f"{stage.step:,}", stage.split, *cells(stage)))
+    print_rows(heading, ["step", "split", *columns], rows, text=["split"], long_text=long_text)
 
 
 TIERS_SHOWN: tuple["Tier", ...] = ("random", "medium", "expert")
@@ -198,29 +208,17 @@ def rewards(dataset: Path, as_json: bool, plot: Path | None, bins: int) -> None:
 
 
 def _print_quality(found: "Quality") -> None:
-    columns = ["step", "split", "parts", "TQ", "IQM", "95%", "min", "max", "tiers"]
-    table = make_table(
-        f"{title(found)}: trajectory quality of snapshots",
-        columns=columns,
-        text=["split"],
-        long_text=["tiers"],
-    )
-    for previous, stage in zip([None, *found.stages], found.stages, strict=False):
+    def cells(stage: "StageQuality") -> Iterator[str]:
         tq = stage.tq
         values = [None] * 4 if tq is None else [tq.mean, tq.iqm, tq.min, tq.max]
         mean, iqm, least, most = map(number, values)
         low, high = (None, None) if tq is None else (tq.low, tq.high)
-        table.add_row(
-            *stage_cells(previous, stage),
-            f"{stage.parts:,}",
-            mean,
-            iqm,
-            "–" if low is None else f"{number(low)} to {number(high)}",
-            least,
-            most,
-            _tiers(found, stage),
-        )
-    print_table(table)
+        interval = "–" if low is None else f"{number(low)} to {number(high)}"
+        yield from (f"{stage.parts:,}", mean, iqm, interval, least, most, _tiers(found, stage))
+
+    columns = ["parts", "TQ", "IQM", "95%", "min", "max", "tiers"]
+    heading = f"{title(found)}: trajectory quality of snapshots"
+    _print_stages(heading, columns, found.stages, cells, long_text=["tiers"])
 
 
 def _tiers(found: "Quality", stage: "StageQuality") -> str:
@@ -237,18 +235,18 @@ def _tiers(found: "Quality", stage: "StageQuality") -> str:
 
 
 def _print_coverage(found: "Coverage") -> None:
-    columns = ["step", "split", "parts", "steps", "cells", "SACo", "TQ"]
-    table = make_table(f"{title(found)}: means over parts", columns=columns, text=["split"])
-    for previous, stage in zip([None, *found.stages], found.stages, strict=False):
-        table.add_row(
-            *stage_cells(previous, stage),
+    _print_stages(
+        f"{title(found)}: means over parts",
+        ["parts", "steps", "cells", "SACo", "TQ"],
+        found.stages,
+        lambda stage: (
             f"{stage.parts:,}",
             f"{stage.steps:,.0f}",
             f"{stage.cells:,.0f}",
             number(stage.saco),
             number(stage.tq),
-        )
-    print_table(table)
+        ),
+    )
     rows, tasks = found.overlap.shares, len(found.overlap.tasks)
     if tasks > 1:
         mean = (sum(map(sum, rows)) - tasks) / (tasks * (tasks - 1))
@@ -256,18 +254,18 @@ def _print_coverage(found: "Coverage") -> None:
 
 
 def _print_rewards(found: "Rewards") -> None:
-    columns = ["step", "split", "parts", "steps", "zero", "silent episodes", "mean", "min", "max"]
-    table = make_table(f"{title(found)}: stored rewards", columns=columns, text=["split"])
-    for previous, stage in zip([None, *found.stages], found.stages, strict=False):
-        table.add_row(
-            *stage_cells(previous, stage),
+    _print_stages(
+        f"{title(found)}: stored rewards",
+        ["parts", "steps", "zero", "silent episodes", "mean", "min", "max"],
+        found.stages,
+        lambda stage: (
             f"{stage.parts:,}",
             f"{stage.steps:,}",
             f"{stage.zero:.1%}",
             f"{stage.silent:.1%}",
-            *(number(value) for value in (stage.mean, stage.min, stage.max)),
-        )
-    print_table(table)
+            *map(number, (stage.mean, stage.min, stage.max)),
+        ),
+    )
 
 
 MAX_TASKS = click.option(
@@ -399,60 +397,48 @@ def worth(
 
 
 def _print_transfer(found: "Transfer") -> None:
-    table = make_table(
-        f"{title(found)}: last policies in {len(found.tasks)} tasks, {found.episodes} episodes each",
-        columns=["task", "split", "step", "own", "others' policies", "in other tasks", "own score", "others"],
-        text=["split"],
-    )
+    rows = []
     for place, task in enumerate(found.tasks):
         column = [row[place] for row in found.returns]
         others = [value for source, value in enumerate(column) if source != place]
         elsewhere = [value for target, value in enumerate(found.returns[place]) if target != place]
         scores = [row[place] for other, row in enumerate(found.scores) if other != place]
         known = [score for score in scores if score is not None]
-        table.add_row(
-            str(task.task),
-            task.split,
-            f"{task.step:,}",
-            number(column[place]),
-            number(sum(others) / len(others)),
-            number(sum(elsewhere) / len(elsewhere)),
-            number(found.scores[place][place]),
-            number(sum(known) / len(known) if known else None),
-        )
-    print_table(table)
+        means = (column[place], sum(others) / len(others), sum(elsewhere) / len(elsewhere))
+        of_scores = (found.scores[place][place], sum(known) / len(known) if known else None)
+        rows.append((str(task.task), task.split, f"{task.step:,}", *map(number, (*means, *of_scores))))
+    heading = f"{title(found)}: last policies in {len(found.tasks)} tasks, {found.episodes} episodes each"
+    columns = ["task", "split", "step", "own", "others' policies", "in other tasks", "own score", "others"]
+    print_rows(heading, columns, rows, text=["split"])
     _print_left_out(found)
 
 
 def _print_worth(found: "Worth") -> None:
     columns = ["split", "tasks", "uniform", "best single", "own", "best known", "worth", "95%"]
-    table = make_table(f"{title(found)}: what a context can gain", columns=columns, text=["split"])
+    rows = []
     for row in found.splits:
         low, high = row.low, row.high
-        table.add_row(
-            row.split,
-            str(row.tasks),
-            *(number(value) for value in (row.uniform, row.single, row.own, row.best)),
-            "–" if row.worth is None else f"{row.worth:.1%}",
-            "–" if low is None or high is None else f"{low:.1%} to {high:.1%}",
-        )
-    print_table(table)
+        returns = map(number, (row.uniform, row.single, row.own, row.best))
+        share = "–" if row.worth is None else f"{row.worth:.1%}"
+        interval = "–" if low is None or high is None else f"{low:.1%} to {high:.1%}"
+        rows.append((row.split, str(row.tasks), *returns, share, interval))
+    print_rows(f"{title(found)}: what a context can gain", columns, rows, text=["split"])
     if any(row.worth is not None and row.worth > 1 for row in found.splits):
         remark(
             "A worth above 100%: the best known returns are those of stored policies, and own policies now "
             "gained more over the best single one than the range from uniform actions to them."
         )
-    columns = ["step", "split", "tasks", "rewarded", "in rewards", "in dynamics"]
-    table = make_table("visibility of the task, by snapshot", columns=columns, text=["split"])
-    for previous, stage in zip([None, *found.stages], found.stages, strict=False):
-        table.add_row(
-            *stage_cells(previous, stage),
+    _print_stages(
+        "visibility of the task, by snapshot",
+        ["tasks", "rewarded", "in rewards", "in dynamics"],
+        found.stages,
+        lambda stage: (
             str(stage.tasks),
             f"{stage.rewarded:.1%}",
             number(stage.reward),
             number(stage.dynamics),
-        )
-    print_table(table)
+        ),
+    )
     click.echo(f"The best single policy is that of task {found.single_task}.")
     _print_left_out(found)
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from .frame import make_table, number, output_options, print_json, print_table, remark
+from .frame import number, output_options, print_json, print_rows, remark
 from .options import PATH
 from .places import RUN_PATH
 from .progress import StageProgress
@@ -165,15 +165,13 @@ def runs(folder: Path | None, metrics: tuple[str, ...], as_json: bool) -> None:
     if not rows:
         remark(f"no runs in {folder}; train one with `tcmrl train DATASET`")
         return
-    table = make_table(
+    print_rows(
         f"Runs in {folder}",
-        columns=["run", "trained", "steps", "dataset", *metrics, "last return"],
+        ["run", "trained", "steps", "dataset", *metrics, "last return"],
+        [_cells(row, metrics) for row in rows],
         text=["run", "dataset"],  # a run's name is never folded: it is copied
         long_text=["trained"],
     )
-    for row in rows:
-        table.add_row(*_cells(row, metrics))
-    print_table(table)
 
 
 def _cells(row: dict[str, Any], metrics: Sequence[str]) -> tuple[str, ...]:
