@@ -2,6 +2,7 @@
 # make test   the tests that a change should pass at once
 # make check  what continuous integration runs: linters, types, and all tests but the sweeps
 # make sweeps what takes hours: every kill, every fault, a million parts; before a release
+# make packages   wheel and sdist, each installed afresh with what reading needs, and tried on a dataset
 # make docs   the documentation as a site, in build/docs
 # make results   results/README.md from the tables beside it
 PYTHON ?= python3
@@ -14,6 +15,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 INSTALLED_TEST := $(VENV)/.installed-test
 INSTALLED_DOCS := $(VENV)/.installed-docs
+READER := build/packages/reader/bin
 SPHINX := $(BIN)/python -m sphinx --keep-going --quiet
 # The tests of a file stay together, so that its fixtures are made once.
 SPREAD := -n $(JOBS) --dist worksteal
@@ -23,7 +25,7 @@ export MPLBACKEND ?= Agg
 # Hundreds of processes would compile the packages again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check sweeps format docs docs-links results clean
+.PHONY: demo test check packages sweeps format docs docs-links results clean
 
 $(BIN)/python:
 	@$(PYTHON) -c "import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), 'Python 3.11 to 3.13 needed: make PYTHON=python3.11'"
@@ -59,6 +61,17 @@ check: $(INSTALLED_TEST)
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest $(SPREAD) -m "not sweep"
+
+packages: $(INSTALLED)
+	@rm -rf build/lib build/bdist.* build/packages
+	@mkdir -p build/packages
+	$(BIN)/python -c "from setuptools import build_meta as b; b.build_wheel('build/packages'); b.build_sdist('build/packages')" > build/packages/log 2>&1
+	$(PYTHON) -m venv build/packages/reader
+	$(READER)/pip install --quiet -c constraints.txt -r requirements-reader.txt
+	$(READER)/pip install --quiet --no-deps build/packages/*.tar.gz
+	$(READER)/tcmrl-data show tests/frozen/dataset
+	$(READER)/pip install --quiet --no-deps --force-reinstall build/packages/*.whl
+	$(READER)/tcmrl-data verify tests/frozen/dataset
 
 sweeps: $(INSTALLED_TEST)
 	$(BIN)/python -m pytest $(SPREAD) --sweep 1 -m sweep
