@@ -109,6 +109,11 @@ BUSY_SHARE = 0.25
     metavar="ROOT|DATASET",
     help="Root of a published dataset, or its folder or address: say whether the build is equal to it.",
 )
+@click.option(
+    "--check-published",
+    is_flag=True,
+    help="Say whether the build has the root that came with this package.",
+)
 @output_options
 @click.pass_context
 def build(
@@ -128,6 +133,7 @@ def build(
     ray_address: str | None,
     checkpoint_every: float,
     expect_root: str | None,
+    check_published: bool,
     as_json: bool,
 ) -> None:
     """Build a dataset, or the missing parts of one.
@@ -143,6 +149,7 @@ def build(
 
     With --expect-root the exit code is 1 if the root is not the published one. Of a published dataset the
     first part that differs is named, and why: builds on other processors or packages may differ.
+    --check-published does so for the roots of own recipes that come with this package.
 
     \b
     Examples:
@@ -157,6 +164,7 @@ def build(
     """
     import tcmrl_data
     from tcmrl_data.dataset.diff import why_not_published
+    from tcmrl_data.dataset.roots import published_roots, why_not_as_published
 
     if as_recipe:
         allow_only(context, "--recipe", "profile", "overrides")
@@ -174,6 +182,7 @@ def build(
         _print_plan(tcmrl_data.plan_build(recipe, tasks=chosen), workers=workers, as_json=as_json)
         return
     expected = None if expect_root is None else _published(expect_root)
+    roots = published_roots(recipe, seed) if check_published else None
     dropped = drop_tasks and tcmrl_data.parse_indices(drop_tasks, limit, option="--drop-tasks")
     out = out or Path("data") / recipe.environment.name
     is_new = not as_json and not (out / "manifest.json").exists()
@@ -209,10 +218,16 @@ def build(
     if report.failed:
         more = "" if len(report.failed) == 1 else f" (and {len(report.failed) - 1} more)"
         fail_incomplete(f"{report.failed[0]}{more}; run the same command again to build the missing parts")
-    elif expected is not None:
-        problem = why_not_published(out, expected)
+        return
+    problems = []
+    if expected is not None:
+        problems.append(why_not_published(out, expected))
+    if roots is not None:
+        problems.append(why_not_as_published(tcmrl_data.open_dataset(out), roots))
+    for problem in problems:
         if problem is not None:
             fail_incomplete(problem)
+    if problems:
         remark("root as published")
 
 

@@ -24,6 +24,7 @@ MEANINGS = {
     "--bins": "a number of bins of a histogram",
     "--build": "build what is missing",
     "--cell": "the width of a cell",
+    "--check-published": "compare with the roots of this package",
     "--checkpoint-every": "seconds between two checkpoints",
     "--clean": "remove leftovers",
     "--cross": "a number of near tasks",
