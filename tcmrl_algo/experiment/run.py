@@ -1,13 +1,16 @@
-"""Runs an experiment: skips finished runs, resumes killed ones, several at once, and writes one table."""
+"""Runs an experiment: skips finished runs, resumes killed ones, several at once, and writes one table.
+
+A call that has nothing to do says so without importing torch, which takes longer than all the rest.
+"""
 
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
-from tcmrl_algo.experiment.job import finished_trainings, take_over
-from tcmrl_algo.experiment.plan import check_same, plan_runs, with_threads
+from tcmrl_algo.experiment.datasets import open_datasets
 from tcmrl_algo.experiment.results import (
     DIVERGED,
     Job,
@@ -19,14 +22,14 @@ from tcmrl_algo.experiment.results import (
     table_text,
 )
 from tcmrl_algo.experiment.spec import Experiment
-from tcmrl_algo.training.train import usable_device
 from tcmrl_data import TrainingError
 from tcmrl_data.engine.base import BaseEngine, Unit, make_engine
 from tcmrl_data.foundation.disk import lock_file, make_folders, replace_file
 from tcmrl_data.foundation.machine import available_cores
-from tcmrl_data.foundation.records import read_record, write_record
+from tcmrl_data.foundation.records import Frozen, digest, read_record, write_record
 
 WORKER = "tcmrl_algo.experiment.job"
+PACKAGE = Path(__file__).parents[1]
 
 Report = Callable[[RunResult | str, int, int, float | None], None]
 """Receives a run as it ends, or `run: reason` where it failed; how many have ended, of how many; and the
@@ -96,6 +99,30 @@ def run_experiment(
         >>> run_experiment(experiment, "results/perspectives", workers=2).results  # doctest: +SKIP
     """
     began, out, cores = time.perf_counter(), Path(out), available_cores()
+    call = {
+        "experiment": experiment.to_json(),
+        "only": list(only),
+        "environments": list(environments),
+        "seeds": None if seeds is None else list(seeds),
+        "steps": steps,
+        "overrides": list(overrides),
+        "tuned": None
+        if tuned is None
+        else {
+            name: {algorithm: one.model_dump(mode="json") for algorithm, one in settings.items()}
+            for name, settings in tuned.items()
+        },
+    }
+    datasets = open_datasets(experiment.on(environments), Path(data))
+    call["roots"] = {name: dataset.manifest.root for name, dataset in datasets.items()}
+    if (names := _nothing_to_do(out, call)) is not None:
+        results = tuple(read_result(out / "runs" / name) for name in names)
+        return ExperimentReport(out, results, len(results), (), {}, time.perf_counter() - began)
+
+    from tcmrl_algo.experiment.job import finished_trainings, take_over
+    from tcmrl_algo.experiment.plan import plan_runs
+    from tcmrl_algo.training.train import usable_device
+
     usable_device(device)
     workers = workers or cores
     every = plan_runs(
@@ -141,8 +168,49 @@ def run_experiment(
             is_known = done - present >= min(workers, len(jobs))
             if report is not None:
                 report(ended, done, len(plan), pace * (len(plan) - done) if is_known else None)
+        if not failed:
+            write_record(out / LAST_CALL, LastCall(state=_state(out, call), runs=tuple(found)))
     results = tuple(result for result in found.values() if result is not None)
     return ExperimentReport(out, results, present, tuple(failed), diverged, time.perf_counter() - began)
+
+
+class LastCall(Frozen):
+    """`last_call.json` of a results folder: of a call that left nothing to do.
+
+    Attributes:
+        state: digest of what it was asked, of this package's files and of the results.
+        runs: ids, in the order of the plan.
+    """
+
+    state: str
+    runs: tuple[str, ...]
+
+
+LAST_CALL = "last_call.json"
+
+
+def _nothing_to_do(out: Path, call: Mapping[str, Any]) -> tuple[str, ...] | None:
+    """The finished runs, if the last call was the same and neither results nor code were changed since."""
+    file = out / LAST_CALL
+    if not file.is_file():
+        return None
+    last = read_record(LastCall, file, remedy="; delete it")
+    return last.runs if last.state == _state(out, call) else None
+
+
+def _state(out: Path, call: Mapping[str, Any]) -> str:
+    files = {
+        str(file.relative_to(folder)): [file.stat().st_size, file.stat().st_mtime_ns]
+        for folder, pattern in (
+            (out, "*.json"),
+            (out, "table.csv"),
+            (out, "runs/*.json"),
+            (PACKAGE, "**/*.py"),
+        )
+        for file in folder.glob(pattern)
+        if file.name != LAST_CALL
+    }
+    return digest([dict(call), files])
 
 
 def _chosen(plan: Sequence[Job], experiment: Experiment, only: Sequence[str]) -> list[Job]:
@@ -156,6 +224,8 @@ def _chosen(plan: Sequence[Job], experiment: Experiment, only: Sequence[str]) ->
 
 def _finished(plan: Sequence[Job], out: Path, experiment: Experiment) -> dict[str, RunResult]:
     """Results that the folder holds, by run, of other seeds than the planned ones too."""
+    from tcmrl_algo.experiment.plan import check_same
+
     planned = {(job.environment, job.method, job.fold): job.identity for job in plan}
     found = {}
     for result in read_results(out, experiment):
@@ -169,6 +239,8 @@ def _finished(plan: Sequence[Job], out: Path, experiment: Experiment) -> dict[st
 
 def _begun(job: Job) -> Job:
     """The job; one that has begun training keeps its threads, its device and what it took over."""
+    from tcmrl_algo.experiment.plan import check_same, with_threads
+
     folder = Path(job.folder)
     if not ((folder / "run.json").is_file() and (folder / "job.json").is_file()):
         return job
