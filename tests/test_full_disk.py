@@ -43,7 +43,7 @@ def test_an_export_to_a_full_disk_names_the_file_and_leaves_nothing(
 ) -> None:
     pytest.importorskip(PACKAGES.get(name, "h5py"))
     result = run_mounted(
-        small_disk(tmp_path, 300),
+        small_disk(tmp_path, 100),
         *("export", tiny_folder, "--format", name, "--out", tmp_path / "out", "--quiet"),
         then=f"ls -A {tmp_path}",
     )
