@@ -59,7 +59,7 @@ class Sources:
         target = folder if out is None else out
 
         def keys_of(unit: Unit) -> Sequence[PartKey]:
-            return [PartKey(*key) for _, key in unit.spec["jobs"]]
+            return [PartKey(*job["key"]) for job in unit.spec["jobs"]]
 
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(

@@ -27,6 +27,8 @@ from tests.environments import environment_of
 from tests.plugin_packages import install
 from tests.terminal import as_in_terminal, assert_fits
 
+PROGRAM = tcmrl
+
 SMALL = ("batch.transitions=8", "actor_critic.hidden=[8]", "tcmrl.latent=4", "run.episodes=3")
 
 
@@ -284,8 +286,6 @@ def test_one_protocol_shows_its_tasks_and_their_mean(trained: Path, call: Call) 
 
 PLUGIN = """
 from tcmrl_algo import Adaptation, Protocol
-
-PROGRAM = tcmrl
 
 class Plugin(Protocol):
     name = "borrowed"
