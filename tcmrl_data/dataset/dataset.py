@@ -28,15 +28,14 @@ from tcmrl_data.foundation.errors import (
     TrajectoryError,
     UnknownNameError,
 )
-from tcmrl_data.foundation.files import one_line, read_plain_file
-from tcmrl_data.foundation.records import first_problem, sha256
+from tcmrl_data.foundation.records import first_problem
 from tcmrl_data.remote.address import Address, is_url, parse_address
 from tcmrl_data.remote.files import RemoteFiles, open_remote
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.manifest import MANIFEST, Manifest, dataset_folder, read_manifest
 from tcmrl_data.store.part import PartRecord, References, check_members, read_part_record
-from tcmrl_data.store.part_table import PARTS_TABLE, REFERENCES, PartEntry, PartTable, parse_parts
+from tcmrl_data.store.part_table import PARTS_TABLE, REFERENCES, PartEntry, PartTable, parse_parts, read_part
 from tcmrl_data.store.tables import MAIN_RUN, TASKS, PartKey, parse_tasks, part_file, read_sealed
 
 KEPT_RECORDS = 1000
@@ -319,14 +318,7 @@ class Dataset:
             SelectionError: the dataset has no such part.
             StoreError: the archive is missing or damaged.
         """
-        entry, file = self.entry(key), self.file_of(key)
-        try:
-            data = read_plain_file(file, limit=entry.size)
-        except (OSError, ValueError) as error:
-            raise StoreError(f"{file}: {one_line(error)}; run `tcmrl-data verify --repair`") from None
-        if sha256(data) != entry.sha256:
-            raise StoreError(f"{file} does not have the recorded sha256; run `tcmrl-data verify --repair`")
-        return data
+        return read_part(self.file_of(key), self.entry(key))
 
     def open_part(self, key: PartKey) -> Archive:
         """Opens a part's archive, to be closed by the caller.

@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from tcmrl_data.foundation.errors import ManifestError, StoreError
-from tcmrl_data.foundation.files import one_line, read_plain_file
-from tcmrl_data.foundation.records import MAX_JSON_BYTES, sha256
+from tcmrl_data.foundation.errors import ManifestError
+from tcmrl_data.foundation.files import read_plain_file
+from tcmrl_data.foundation.records import MAX_JSON_BYTES
 from tcmrl_data.recipe.imported import UNKNOWN
 from tcmrl_data.store.manifest import MANIFEST, Manifest, read_manifest
-from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, parse_parts
+from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, parse_parts, read_part
 from tcmrl_data.store.tables import TASKS, part_file, read_sealed
 
 MEMORY = 256 * 10**6
@@ -54,15 +54,7 @@ class LocalDataset:
         Raises:
             StoreError: it is missing or damaged.
         """
-        file = self.folder / part_file(entry.key)
-        remedy = "run `tcmrl-data verify --repair`"
-        try:
-            data = read_plain_file(file, limit=entry.size)
-        except (OSError, ValueError) as error:
-            raise StoreError(f"{file}: {one_line(error)}; {remedy}") from None
-        if sha256(data) != entry.sha256:
-            raise StoreError(f"{file} does not have the recorded sha256; {remedy}")
-        return data
+        return read_part(self.folder / part_file(entry.key), entry)
 
 
 def read_local(folder: Path) -> LocalDataset:

@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ConfigDict, FailFast, Field, TypeAdapter, ValidationError
 
-from tcmrl_data.foundation.errors import ManifestError
-from tcmrl_data.foundation.files import printable
+from tcmrl_data.foundation.errors import ManifestError, StoreError
+from tcmrl_data.foundation.files import one_line, printable, read_plain_file
 from tcmrl_data.foundation.records import canonical_json, first_problem, sha256
 from tcmrl_data.store.part import PartRecord
 from tcmrl_data.store.tables import MAX_COUNT, MAX_INDEX, MAX_PLATFORMS, RUN_NAME, SHA256, PartKey, blocks
@@ -276,3 +276,19 @@ def _columns(block: bytes, runs: dict[str, int], file: Path) -> dict[str, npt.ND
 
 def _ranks(runs: Sequence[str]) -> npt.NDArray[np.int64]:
     return np.argsort(np.argsort(np.array(runs, dtype=np.str_)))
+
+
+def read_part(file: Path, entry: PartEntry) -> bytes:
+    """The bytes of a part's archive, compared with its line of the table.
+
+    Raises:
+        StoreError: the archive is missing or damaged.
+    """
+    remedy = "run `tcmrl-data verify --repair`"
+    try:
+        data = read_plain_file(file, limit=entry.size)
+    except (OSError, ValueError) as error:
+        raise StoreError(f"{file}: {one_line(error)}; {remedy}") from None
+    if sha256(data) != entry.sha256:
+        raise StoreError(f"{file} does not have the recorded sha256; {remedy}")
+    return data
