@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.store import archive as module
 from tcmrl_data.store.archive import MOST_MEMBERS, Archive, pack_archive
-from tests.hostile.archives import FILES, FORGED, HONEST, INNER, START, forge, zipped
+from tests.hostile.archives import FILES, FORGED, zipped
 
 names = st.from_regex(r"[a-z0-9_][a-z0-9_.]{0,5}(/[a-z0-9_][a-z0-9_.]{0,5}){0,3}", fullmatch=True)
 contents = st.dictionaries(names, st.binary(max_size=300), max_size=6)
@@ -81,12 +81,6 @@ def test_every_flipped_bit_and_every_lost_or_added_byte_is_refused(path: Path) -
         refusal(path)
 
 
-def test_the_forge_writes_the_honest_form_where_nothing_is_forged() -> None:
-    assert forge(HONEST) == pack_archive(FILES)
-    assert len(INNER) == 41 + 51 + 22
-    assert forge(HONEST)[START : START + 4] == b"PK\1\2"
-
-
 @pytest.mark.parametrize("case", FORGED)
 def test_forged_archives_are_refused(case: str, path: Path) -> None:
     path.write_bytes(FORGED[case])
@@ -101,29 +95,17 @@ def test_a_zip_with_other_dates_opens_and_is_told_from_ours(path: Path) -> None:
         assert archive.read("part.json") == b"{}"
 
 
-def _link_to_device(path: Path) -> None:
-    path.symlink_to("/dev/zero")
-
-
-def _link_to_nothing(path: Path) -> None:
-    path.symlink_to("/nothing")
-
-
-def _nothing(path: Path) -> None:
-    pass
-
-
 @pytest.mark.parametrize(
     ("make", "problem"),
     [
-        (_link_to_device, "is a character device, not a plain file"),
+        (lambda path: path.symlink_to("/dev/zero"), "is a character device, not a plain file"),
         (os.mkfifo, "is a FIFO, not a plain file"),
         (Path.mkdir, "is a folder, not a plain file"),
-        (_link_to_nothing, "is missing"),
-        (_nothing, "is missing"),
+        (lambda path: path.symlink_to("/nothing"), "is missing"),
+        (lambda path: None, "is missing"),
     ],
 )
-def test_only_plain_files_are_opened(make: Callable[[Path], None], problem: str, tmp_path: Path) -> None:
+def test_only_plain_files_are_opened(make: Callable[[Path], object], problem: str, tmp_path: Path) -> None:
     make(tmp_path / "part.zip")
     assert problem in refusal(tmp_path / "part.zip")
 
@@ -138,7 +120,7 @@ def test_refused_archives_leave_no_file_open(tmp_path: Path) -> None:
     path = tmp_path / "part.zip"
     before = os.listdir("/proc/self/fd")
     for _ in range(50):
-        for forged in ("an empty file", "one name twice", "two sizes beyond 32 bits together", "deflate"):
+        for forged in ("an empty file", "one name twice", "a member beyond the file", "deflate"):
             path.write_bytes(FORGED[forged])
             with pytest.raises(StoreError):
                 Archive(path)

@@ -162,9 +162,7 @@ def guarded(forge: Forge) -> Iterator[None]:
     assert files_of(forge.folder.parent) == before
 
 
-def test_the_corpus_is_large_and_its_base_is_sound(two_parts: Path) -> None:
-    sys.stdout.write(f"hostile cases: {len(CASES)}\n")
-    assert len(CASES) >= 60
+def test_the_base_of_the_corpus_is_sound(two_parts: Path) -> None:
     assert len({case.name for case in CASES}) == len(CASES)
     assert look(two_parts) == ("verify", "")
     assert verify_dataset(two_parts, level="deep", replay=1).findings == ()

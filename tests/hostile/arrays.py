@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from tests.hostile.case import ESCAPE, Damage, in_part
+from tests.hostile.case import Damage, in_part
 from tests.hostile.datasets import Forge, offsets, rle_frame, with_checksum
 
 
@@ -32,28 +32,14 @@ def _offsets(values: list[int]) -> Damage:
 
 
 BIG = 2**63 - 1
-CODECS = [{"name": "bytes", "configuration": {"endian": "little"}}]
-SHARDS = {"name": "sharding_indexed", "configuration": {"chunk_shape": [1], "codecs": CODECS}}
 
 LAYOUTS = [
-    in_part("Zarr v2", _zarr(zarr_format=2), "rewards/zarr.json", "zarr_format"),
     in_part("no metadata", lambda f: f.take("rewards/zarr.json"), "rewards/zarr.json", "missing"),
-    in_part("group as array", _zarr(node_type="group"), "rewards/zarr.json", "node_type"),
     in_part("object dtype", _zarr(data_type="|O"), "rewards/zarr.json", "data_type"),
-    in_part("string dtype", _zarr(data_type="string"), "rewards/zarr.json", "data_type"),
-    in_part("bytes dtype", _zarr(data_type="variable_length_bytes"), "rewards/zarr.json", "data_type"),
-    in_part("structured dtype", _zarr(data_type={"name": "structured"}), "rewards/zarr.json", "data_type"),
-    in_part("unknown codec", _zarr(codecs=[*CODECS, {"name": "evil"}]), "rewards/zarr.json", "codecs"),
     in_part("pickle codec", _zarr(codecs=[{"name": "numcodecs.pickle"}]), "rewards/zarr.json", "codecs"),
-    in_part("sharding", _zarr(codecs=[SHARDS]), "rewards/zarr.json", "codecs"),
-    in_part(
-        "storage transformer", _zarr(storage_transformers=[{"name": "x"}]), "rewards/zarr.json", "storage"
-    ),
     in_part("negative rows", _zarr(shape=[-1]), "rewards/zarr.json", "shape"),
-    in_part("overflowing rows", _zarr(shape=[BIG]), "rewards/zarr.json", "shape"),
     in_part("rows beyond int64", _zarr(shape=[2**70]), "rewards/zarr.json", "shape"),
     in_part("ten axes", _zarr(shape=[1] * 10), "rewards/zarr.json", "shape"),
-    in_part("rows as float", _zarr(shape=[120.0]), "rewards/zarr.json", "shape"),
     in_part("petabytes", lambda f: f.lengthen(2**39), "", "shape asks for"),
     in_part(
         "huge chunks",
@@ -67,21 +53,7 @@ LAYOUTS = [
         "rewards/zarr.json",
         "chunk_shape",
     ),
-    in_part(
-        "chunk names", _zarr(chunk_key_encoding={"name": "v2"}), "rewards/zarr.json", "chunk_key_encoding"
-    ),
-    in_part("attributes", _zarr(attributes={ESCAPE: 1}), "rewards/zarr.json", "attributes"),
-    in_part("fill value", _zarr(fill_value="0x7fc00000"), "rewards/zarr.json", "fill_value"),
-    in_part(
-        "axes of another array", _zarr(dimension_names=["episode"]), "rewards/zarr.json", "dimension_names"
-    ),
     in_part("unknown field", _zarr(must_understand=True), "rewards/zarr.json", "must_understand"),
-    in_part(
-        "metadata NaN", lambda f: f.write("rewards/zarr.json", b'{"shape":NaN}'), "rewards/zarr.json", "NaN"
-    ),
-    in_part(
-        "metadata deep", lambda f: f.write("rewards/zarr.json", b"[" * 10**4), "rewards/zarr.json", "nested"
-    ),
     in_part(
         "metadata big", lambda f: f.write("rewards/zarr.json", b" " * 10**6), "rewards/zarr.json", "bytes"
     ),
@@ -96,7 +68,6 @@ LAYOUTS = [
 CHUNKS = [
     in_part("bomb beyond the chunk", _chunk(rle_frame(2**24, declared=2**24)), "rewards/c/0", "declares"),
     in_part("bomb declared small", _chunk(rle_frame(2**24, declared=480)), "rewards", "does not decode"),
-    in_part("frame of 2**63", _chunk(rle_frame(2**17, declared=2**63)), "rewards/c/0", "declares"),
     in_part(
         "frame without size",
         _chunk(with_checksum(b"\x28\xb5\x2f\xfd\x00\x58" + b"\x03\x00\x00\x00")),
@@ -127,7 +98,6 @@ CHUNKS = [
         "",
         "episode_offsets",
     ),
-    in_part("offsets short", _offsets([0, 20, 40, 60, 80, 100, 119]), "", "episode_offsets"),
     in_part(
         "episodes moved",
         _offsets([0, 20, 40, 60, 80, 101, 120]),

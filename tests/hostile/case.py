@@ -1,7 +1,5 @@
 """A forgery and the ways to make one, for all rooms of a dataset."""
 
-import os
-import socket
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -73,13 +71,3 @@ def special_file(name: str, make: Callable[[Path], object]) -> Damage:
 
 def device(path: Path) -> None:
     path.symlink_to("/dev/zero")
-
-
-def socket_file(path: Path) -> None:
-    here = Path.cwd()
-    os.chdir(path.parent)  # a socket's address must be short
-    try:
-        with socket.socket(socket.AF_UNIX) as server:
-            server.bind(path.name)
-    finally:
-        os.chdir(here)

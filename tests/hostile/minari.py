@@ -34,7 +34,6 @@ MINARI: dict[str, Make] = {
     "minari: metadata in brackets": minari(
         lambda data, _: (data / "metadata.json").write_text("[" * 100_000)
     ),
-    "minari: metadata that are a list": minari(lambda data, _: (data / "metadata.json").write_text("[]")),
     "minari: another storage": minari(
         lambda data, _: (data / "metadata.json").write_text('{"data_format": "arrow"}')
     ),

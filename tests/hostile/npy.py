@@ -12,17 +12,6 @@ from tests.hostile.source import TEBI, Make, Places
 from tests.made_up import trajectory
 from tests.test_import_idaq import RunsCode, saved
 
-HEADERS: dict[str, bytes] = {
-    "an empty file": b"",
-    "half a magic": b"\x93NUM",
-    "an unknown version": b"\x93NUMPY\x09\x00\x10\x00" + b" " * 16,
-    "a header of numbers, 8 TiB": b"",
-    "a header of objects, 8 TiB": b"",
-    "a header that is no table": b"",
-    "a header of brackets": b"",
-    "a header that computes": b"",
-}
-
 
 def npy(shape: str, content: bytes, *, descr: str = "'|O'") -> bytes:
     header = f"{{'descr': {descr}, 'fortran_order': False, 'shape': {shape}, }}".encode()
@@ -30,11 +19,13 @@ def npy(shape: str, content: bytes, *, descr: str = "'|O'") -> bytes:
     return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(header)) + header + content
 
 
-HEADERS["a header of numbers, 8 TiB"] = npy(f"({TEBI // 8},)", b"", descr="'<f8'")
-HEADERS["a header of objects, 8 TiB"] = npy(f"({TEBI}, 4)", pickle.dumps(np.zeros((1, 4), dtype=object)))
-HEADERS["a header that is no table"] = npy("(), 'more': ", b"")
-HEADERS["a header of brackets"] = npy("(" * 9_000, b"")
-HEADERS["a header that computes"] = npy("(2**9999999,)", b"")
+HEADERS = {
+    "an empty file": b"",
+    "half a magic": b"\x93NUM",
+    "a header of numbers, 8 TiB": npy(f"({TEBI // 8},)", b"", descr="'<f8'"),
+    "a header of objects, 8 TiB": npy(f"({TEBI}, 4)", pickle.dumps(np.zeros((1, 4), dtype=object))),
+    "a header that computes": npy("(2**9999999,)", b""),
+}
 
 
 def rows(*cells: Any, length: int = 2) -> np.ndarray:
@@ -87,33 +78,17 @@ CODE: dict[str, bytes] = {
     "a memory map": npy(
         "(2, 4)", b"\x80\x03cnumpy.core.multiarray\n_reconstruct\ncnumpy\nmemmap\nK\x00\x85C\x01b\x87R."
     ),
-    "a name with dots": npy(
-        "(2, 4)", b"\x80\x04" + text("numpy") + text("os.system") + b"\x93" + text("x") + b"\x85R."
-    ),
     "a subclass by INST": npy("(2, 4)", b"(S'touch x'\nios\nsystem\n."),
-    "a reference outside": npy("(2, 4)", b"\x80\x03K\x01Q."),
-    "an extension": npy("(2, 4)", b"\x80\x03\x82\x01."),
     "a table": npy("(2, 4)", pickle.dumps({"a": 1}, protocol=3)),
     "a memo of 16 GiB": npy("(2, 4)", b"\x80\x03Nr\xff\xff\xff\x7f0."),
     "bytes of 8 TiB": npy("(2, 4)", b"\x80\x04\x8e" + struct.pack("<Q", TEBI) + b"x."),
-    "a bytearray of 8 TiB": npy("(2, 4)", b"\x80\x05\x96" + struct.pack("<Q", TEBI) + b"x."),
-    "bytes of 2 GiB": npy("(2, 4)", b"\x80\x03B" + struct.pack("<I", 2**31) + b"x."),
-    "a frame of 8 TiB": npy("(2, 4)", b"\x80\x04\x95" + struct.pack("<Q", TEBI) + b"N."),
-    "a million tuples": npy("(2, 4)", b"\x80\x03N" + b"\x85" * 10**6 + b"."),
-    "a million marks": npy("(2, 4)", b"\x80\x03" + b"(" * 10**6 + b"."),
-    "a million memos": npy("(2, 4)", b"\x80\x04N" + b"\x94" * 10**6 + b"."),
     "a million lists": npy("(2, 4)", b"\x80\x03" + b"]" * 10**6 + b"a" * (10**6 - 1) + b"."),
     "numbers of 8 TiB": npy("(2, 4)", reconstructed(long(TEBI // 8) + b"\x85", text("f8"), b"C\x01x")),
     "objects without elements": npy("(2, 4)", reconstructed(long(TEBI) + b"K\x04\x86", text("O8"), b"]")),
-    "a negative shape": npy("(2, 4)", reconstructed(long(-1) + b"\x85", text("f8"), b"C\x00")),
-    "a shape that is no number": npy(
-        "(2, 4)", reconstructed(text("8") + b"\x85", text("f8"), b"C\x08xxxxxxxx")
-    ),
     "a type of 8 TiB": npy("(2, 4)", reconstructed(b"K\x01\x85", text(f"V{TEBI}"), b"C\x01x")),
     "another shape than the header's": npy(
         "(1, 4)", pickle.dumps(rows(np.zeros(2), np.zeros(1), 0.0, np.zeros(2)))
     ),
-    "cells of texts": objects(rows("a", "b", "c", "d")),
     "cells of objects": objects(rows(*[rows(1, 2, 3, 4)] * 4)),
     "rows of different widths": objects(
         np.array(

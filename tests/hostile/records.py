@@ -49,25 +49,12 @@ RECORDS = [
         "arrays",
     ),
     in_part("array climbs", _array_name("../../../../../outside/secret"), "part.json", "no array name"),
-    in_part("array absolute", _array_name("/etc"), "part.json", "no array name"),
-    in_part("array case", _array_name("Rewards"), "part.json", "no array name"),
-    in_part("array lookalike", _array_name("rеwards"), "part.json", "no array name"),
     in_part("array newline", _array_name("rewards\n"), "part.json", "control characters"),
-    in_part("array NUL", _array_name("rewards\0"), "part.json", "control characters"),
-    in_part("array 5000", _array_name("a" * 5000), "part.json", "no array name"),
-    in_part("array drive", _array_name("c:\\x"), "part.json", "no array name"),
     in_part("array without files", _array_name("success"), "arrays/success/zarr.json", "missing"),
     in_part("40 arrays", _many_arrays, "part.json", "identity.arrays"),
     in_part("record missing", lambda f: f.take("part.json"), "part.json", "missing"),
-    in_part("record empty", lambda f: f.write("part.json", b""), "part.json", "not a part record"),
     in_part("record a list", lambda f: f.write("part.json", b"[]"), "part.json", "schema_version"),
     in_part("record deep", lambda f: f.write("part.json", b"[" * 10**5), "part.json", "nested"),
-    in_part(
-        "record of many values",
-        lambda f: f.write("part.json", b"[" + b"[]," * 200_000 + b"[]]"),
-        "part.json",
-        "values",
-    ),
     in_part(
         "record of an earlier version",
         lambda f: f.record(lambda v: v.update(schema_version=1)),
@@ -84,7 +71,6 @@ RECORDS = [
     in_part("chunk missing", lambda f: f.take("rewards/c/0"), "arrays/rewards/c/0", "agree"),
     in_part("policy missing", lambda f: f.take("policy.json"), "policy.json", "agree"),
     in_part("weights missing", lambda f: f.take("policy.safetensors"), "policy.safetensors", "missing"),
-    in_part("code beside data", lambda f: f.write("policy.py", b"import os"), "policy.py", "agree"),
     in_part("pickle beside data", lambda f: f.write("policy.pkl", f.payload()), "policy.pkl", "agree"),
     in_part(
         "object array",
@@ -93,19 +79,10 @@ RECORDS = [
         "dtype",
     ),
     in_part(
-        "float offsets",
-        _identity(lambda v: v["arrays"]["episode_offsets"].update(dtype="float32")),
-        "part.json",
-        "episode_offsets",
-    ),
-    in_part(
         "negative shape",
         _identity(lambda v: v["arrays"]["actions"].update(shape=[-120, 2])),
         "part.json",
         "shape",
-    ),
-    in_part(
-        "huge shape", _identity(lambda v: v["arrays"]["rewards"].update(shape=[2**80])), "part.json", "shape"
     ),
     in_part(
         "no episodes",
@@ -114,18 +91,6 @@ RECORDS = [
         "shape",
     ),
     in_part("no rewards", _identity(lambda v: v["arrays"].pop("rewards")), "part.json", "rewards is missing"),
-    in_part(
-        "mean 1e999",
-        lambda f: f.record(lambda v: None, text=lambda t: t.replace('"mean":', '"mean":1e999,"x":')),
-        "part.json",
-        "too large",
-    ),
-    in_part(
-        "duplicate key in the record",
-        lambda f: f.record(lambda v: None, text=lambda t: t.replace('"mean":', '"mean":1,"mean":')),
-        "part.json",
-        "duplicate key 'mean'",
-    ),
     in_part(
         "mean edited",
         lambda f: f.record(lambda v: v["statistics"].update(mean=1e6)),
