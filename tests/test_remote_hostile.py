@@ -7,6 +7,7 @@ import itertools
 import json
 import resource
 import shutil
+import time
 import tracemalloc
 from collections.abc import Callable, Iterator
 from http.server import BaseHTTPRequestHandler
@@ -20,8 +21,11 @@ pytest.importorskip("obstore", reason="needs the extra `remote`")
 
 from tcmrl_data import TcmrlError, open_dataset, pull_dataset
 from tcmrl_data.dataset.listing import list_datasets
+from tcmrl_data.foundation.machine import resident_memory
 from tcmrl_data.foundation.records import canonical_json, sealed, sha256
 from tcmrl_data.remote import objects
+from tcmrl_data.remote.address import parse_address
+from tcmrl_data.remote.objects import LISTED_BYTES, Objects, OversizeError
 from tcmrl_data.store.manifest import MANIFEST
 from tests.remotes import serving
 
@@ -324,34 +328,101 @@ def test_a_tag_that_names_another_manifest_is_refused(tmp_path: Path) -> None:
 
 
 LISTING = """<?xml version="1.0" encoding="UTF-8"?>
-<ListBucketResult xmlns="http://s3.amazonaws.com/doc/2006-03-01/"><Name>bucket</Name><IsTruncated>false
-</IsTruncated>{}</ListBucketResult>"""
+<ListBucketResult xmlns="http://s3.amazonaws.com/doc/2006-03-01/"><Name>bucket</Name>{}
+</ListBucketResult>"""
+MORE = "<IsTruncated>true</IsTruncated><NextContinuationToken>{}</NextContinuationToken>"
+FILE = """<Contents><Key>parts/{}</Key><LastModified>2026-01-01T00:00:00.000Z</LastModified>
+<ETag>"0"</ETag><Size>1</Size></Contents>"""
+Page = Callable[[int], Iterator[bytes]]
 
 
-def test_names_in_a_listing_lead_nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    names = ("../", "a/../../", "\u202ebackwards/", "x@y@z/", "%2e%2e/")
-    prefixes = "".join(f"<CommonPrefixes><Prefix>{name}</Prefix></CommonPrefixes>" for name in names)
+@contextlib.contextmanager
+def hostile_bucket(page: Page) -> Iterator[Objects]:
+    """A bucket whose server answers a request by the page of its number."""
+    numbers = itertools.count()
 
     class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
-
         def log_message(self, format: str, *args: object) -> None:
             """Says nothing."""
 
         def do_GET(self) -> None:
-            body = LISTING.format(prefixes).encode()
-            self.send_response(200)
-            self.send_header("Content-Length", str(len(body)))
-            self.end_headers()
-            self.wfile.write(body)
+            _send(self, page(next(numbers)))
 
-    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "key")
-    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
-    with serving(Handler) as address:
-        monkeypatch.setenv("AWS_ENDPOINT_URL", address)
-        with contextlib.suppress(TcmrlError):
-            assert list_datasets("s3://bucket") == []
+    with serving(Handler) as address, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AWS_ACCESS_KEY_ID", "key")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+        patch.setenv("AWS_ENDPOINT_URL", address)
+        yield Objects(parse_address("s3://bucket"))
+
+
+def test_names_in_a_listing_lead_nowhere(tmp_path: Path) -> None:
+    names = ("../", "a/../../", "\u202ebackwards/", "x@y@z/", "%2e%2e/")
+    prefixes = "".join(f"<CommonPrefixes><Prefix>{name}</Prefix></CommonPrefixes>" for name in names)
+    page = LISTING.format(f"<IsTruncated>false</IsTruncated>{prefixes}").encode()
+    with hostile_bucket(lambda number: iter([page])), contextlib.suppress(TcmrlError):
+        assert list_datasets("s3://bucket") == []
     assert list(tmp_path.iterdir()) == []
+
+
+def test_folders_without_end_are_refused() -> None:
+    folders = "".join(f"<CommonPrefixes><Prefix>{n}/</Prefix></CommonPrefixes>" for n in range(1_001))
+    page = LISTING.format(f"<IsTruncated>false</IsTruncated>{folders}").encode()
+    with (
+        hostile_bucket(lambda number: iter([page])),
+        pytest.raises(TcmrlError, match="more than 1,000 folders"),
+    ):
+        list_datasets("s3://bucket")
+
+
+def files_without_end(number: int) -> Iterator[bytes]:
+    yield LISTING.format(MORE.format(number) + FILE.format(number)).encode()
+
+
+def one_file_without_end(number: int) -> Iterator[bytes]:
+    yield LISTING.format(MORE.format(number) + FILE.format(0)).encode()
+
+
+def empty_pages_without_end(number: int) -> Iterator[bytes]:
+    yield LISTING.format(MORE.format(number)).encode()
+
+
+def page_without_end(number: int) -> Iterator[bytes]:
+    yield LISTING.partition("{}")[0].encode()
+    yield from itertools.repeat(b" " * 2**16)
+
+
+@pytest.mark.parametrize(
+    "page", [files_without_end, one_file_without_end, empty_pages_without_end, page_without_end]
+)
+def test_a_listing_without_end_is_refused(monkeypatch: pytest.MonkeyPatch, page: Page) -> None:
+    with hostile_bucket(page) as bucket:
+        for look in (bucket.listing, bucket.folder):
+            before, began = resident_memory(), time.monotonic()
+            with pytest.raises(OversizeError, match="has a listing that does not end"):
+                look()
+            assert resident_memory() - before < LISTED_BYTES + MEMORY
+            assert time.monotonic() - began < 10  # PATIENCE is 0.3
+
+
+def test_a_listing_takes_no_more_memory_than_is_allowed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(objects, "PATIENCE", 60)
+    monkeypatch.setattr(objects, "LISTED_BYTES", 2**25)
+    with hostile_bucket(page_without_end) as bucket:
+        before = resident_memory()
+        with pytest.raises(OversizeError, match=r"does not end within 60 s and 33\.6 MB"):
+            bucket.folder()
+        assert resident_memory() - before < 2**25 + MEMORY
+
+
+@pytest.mark.parametrize("page", [files_without_end, one_file_without_end])
+def test_a_listing_names_no_more_files_than_a_dataset_may_have(
+    monkeypatch: pytest.MonkeyPatch, page: Page
+) -> None:
+    monkeypatch.setattr(objects, "PATIENCE", 60)
+    monkeypatch.setattr(objects, "LISTED", 10)
+    monkeypatch.setattr(objects, "MOST_FILES", 100)
+    with hostile_bucket(page) as bucket, pytest.raises(OversizeError, match="has more than 100 files"):
+        bucket.listing()
 
 
 def test_a_sound_server_is_read(tmp_path: Path) -> None:

@@ -41,6 +41,12 @@ def available_memory() -> int:
     return max(0, min([_machine_memory(), *_memory_quotas()]))
 
 
+def resident_memory() -> int:
+    """Bytes of memory that this process occupies."""
+    pages = Path("/proc/self/statm").read_text().split()[1]
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")
+
+
 def _machine_memory() -> int:
     for line in Path("/proc/meminfo").read_text().splitlines():
         if line.startswith("MemAvailable:"):

@@ -3,11 +3,15 @@
 A request is made again where it may succeed then. Never more of an answer is taken than the caller allows.
 """
 
+import asyncio
+import contextlib
+import functools
 import hashlib
 import os
 import re
+import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Coroutine, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +20,7 @@ from zlib import crc32
 
 from tcmrl_data.foundation.errors import MissingPackageError, RemoteError
 from tcmrl_data.foundation.files import one_line, printable
+from tcmrl_data.foundation.machine import resident_memory, size
 from tcmrl_data.remote.address import WEB, Address
 
 REQUESTS = 16
@@ -47,6 +52,12 @@ CREDENTIALS = (
 
 MOST_FILES = 2_000_000
 """Files that a listing may name; a dataset has a million parts at most."""
+
+LISTED, LISTED_BYTES = 1_000, 256 * 2**20
+"""Files in one answer of a listing, and bytes by which this process may grow while it arrives."""
+
+GLANCE = 0.02
+"""Seconds between two looks at an answer that arrives."""
 
 _STATUS = re.compile(r"status code: (\d{3})")
 
@@ -215,27 +226,54 @@ class Objects:
         """
         self._check_lists()
 
-        def find(obstore: Any) -> dict[str, Listed]:
+        async def find(obstore: Any) -> dict[str, Listed]:
             files: dict[str, Listed] = {}
-            for piece in obstore.list(self._store, folder or None, chunk_size=1_000):
-                files |= {found["path"]: Listed(found["size"], _md5_of(found["e_tag"])) for found in piece}
-                if len(files) > MOST_FILES:
-                    raise RemoteError(f"{self.address.base}/{folder} has more than {MOST_FILES:,} files")
+            number, stream = 0, obstore.list(self._store, folder or None, chunk_size=LISTED)
+            with contextlib.suppress(StopAsyncIteration):
+                while True:
+                    piece = await self._bounded(anext(stream), folder)
+                    files |= {
+                        found["path"]: Listed(found["size"], _md5_of(found["e_tag"])) for found in piece
+                    }
+                    number += len(piece)
+                    if number > MOST_FILES:
+                        raise OversizeError(
+                            f"{self.address.base}/{folder} has more than {MOST_FILES:,} files"
+                        )
             return files
 
-        return self._attempt(folder, find)
+        return self._attempt(folder, lambda obstore: _awaited(find(obstore)))
 
     def folder(self, folder: str = "") -> tuple[list[str], list[str]]:
         """Names of the folders and of the files in a folder, sorted; errors as of `listing`."""
         self._check_lists()
 
-        def look(obstore: Any) -> tuple[list[str], list[str]]:
-            found = obstore.list_with_delimiter(self._store, folder or None)
+        async def look(obstore: Any) -> tuple[list[str], list[str]]:
+            answer = obstore.list_with_delimiter_async(self._store, folder or None)
+            found = await self._bounded(answer, folder)
             paths = (found["common_prefixes"], [file["path"] for file in found["objects"]])
             folders, files = (sorted(path.rpartition("/")[2] for path in group) for group in paths)
             return folders, files
 
-        return self._attempt(folder, look)
+        return self._attempt(folder, lambda obstore: _awaited(look(obstore)))
+
+    async def _bounded(self, answer: Awaitable[Made], folder: str) -> Made:
+        """Waits for an answer of a listing, which obstore would read without end.
+
+        Raises:
+            OversizeError: it takes too long, or too much memory.
+        """
+        waiting, began, before = asyncio.ensure_future(answer), time.monotonic(), resident_memory()
+        try:
+            while not (await asyncio.wait([waiting], timeout=GLANCE))[0]:
+                if time.monotonic() > began + PATIENCE or resident_memory() > before + LISTED_BYTES:
+                    raise OversizeError(
+                        f"{self.address.base}/{folder} has a listing that does not end within "
+                        f"{PATIENCE:.0f} s and {size(LISTED_BYTES)}; name a dataset itself"
+                    )
+            return waiting.result()
+        finally:
+            waiting.cancel()
 
     def _check_lists(self) -> None:
         if self.address.protocol in WEB:
@@ -338,6 +376,23 @@ def _reason(error: Exception) -> str:
     if status:
         text = f"the server answers {status[1]}{f' ({code[1]})' if code else ''}"
     return printable(" ".join(text.split())[:300]) or type(error).__name__
+
+
+def _awaited(work: Coroutine[Any, Any, Made]) -> Made:
+    """The result of a coroutine; Ctrl-C ends it."""
+    waiting = asyncio.run_coroutine_threadsafe(work, _loop(os.getpid()))
+    try:
+        return waiting.result()
+    finally:
+        waiting.cancel()
+
+
+@functools.cache
+def _loop(process: int) -> asyncio.AbstractEventLoop:
+    """An event loop of a process in a thread of its own: a notebook runs another one in its main thread."""
+    loop = asyncio.new_event_loop()
+    threading.Thread(target=loop.run_forever, name=f"listing of {process}", daemon=True).start()
+    return loop
 
 
 def each(work: Callable[[Item], None], items: list[Item], *, workers: int = REQUESTS) -> None:

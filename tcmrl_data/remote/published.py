@@ -28,8 +28,8 @@ CLAIM, REFS, VERSIONS = "pushed.json", "refs", "versions"
 
 REF_BYTES, REF_SCHEMA = 4_096, 1
 
-MOST_FOLDERS = 1_000
-"""Folders that a search for datasets looks into, with a request each."""
+MOST_FOLDERS, MOST_TAGS = 1_000, 10_000
+"""Folders that a search for datasets looks into, with a request each, and tags of an address."""
 
 
 class Ref(Record):
@@ -119,11 +119,18 @@ def _known(objects: Objects) -> str:
 
 
 def list_tags(objects: Objects) -> list[str]:
-    """The tags of an address, sorted; nothing on a server that lists nothing."""
+    """The tags of an address, sorted; nothing on a server that lists nothing.
+
+    Raises:
+        RemoteError: the server does not answer, or has too many.
+    """
     if objects.address.protocol in WEB:
         return []
     found = (name.removesuffix(".json") for name in objects.folder(REFS)[1] if name.endswith(".json"))
-    return [tag for tag in found if re.fullmatch(TAG_NAME, tag)]
+    tags = [tag for tag in found if re.fullmatch(TAG_NAME, tag)]
+    if len(tags) > MOST_TAGS:
+        raise RemoteError(f"{objects.address.base} has more than {MOST_TAGS:,} tags; name one of them")
+    return tags
 
 
 def find_datasets(address: Address) -> Iterator[Address]:
@@ -133,9 +140,11 @@ def find_datasets(address: Address) -> Iterator[Address]:
         RemoteError: the server does not answer, or lists nothing.
     """
     waiting = [at(address, None)]
-    for _ in range(MOST_FOLDERS):
+    for number in range(MOST_FOLDERS):
         if not waiting:
             return
+        if number + len(waiting) > MOST_FOLDERS:
+            break
         place = waiting.pop()
         objects = Objects(place)
         folders, files = objects.folder()
@@ -147,7 +156,7 @@ def find_datasets(address: Address) -> Iterator[Address]:
         for name in reversed(folders):
             with contextlib.suppress(RemoteError):  # a name that no address has
                 waiting.append(parse_address(f"{place}/{name}"))
-    raise RemoteError(f"{address} has more than {MOST_FOLDERS} folders; name one below it")
+    raise RemoteError(f"{address} has more than {MOST_FOLDERS:,} folders; name one below it")
 
 
 def read_ref(objects: Objects, name: str) -> tuple[Ref, Version] | None:
