@@ -1,6 +1,5 @@
 """`actor_critic.kind`: equations of `iql` and `bc`, what trains what, and that every method takes both."""
 
-import itertools
 import json
 import math
 from dataclasses import replace
@@ -15,24 +14,15 @@ from torch import Tensor
 from tcmrl_algo.algorithms.core.actor_critic.bc import BehaviorCloning
 from tcmrl_algo.algorithms.core.actor_critic.iql import ImplicitQLearning, advantage_weights, expectile_loss
 from tcmrl_algo.algorithms.core.actor_critic.sac import value_loss
-from tcmrl_algo.algorithms.core.context import KINDS, ContextAlgorithm
+from tcmrl_algo.algorithms.core.context import KINDS
 from tcmrl_algo.algorithms.core.losses import gaussian_log_likelihood, likelihood_loss
-from tcmrl_algo.algorithms.core.method import METHODS
 from tcmrl_algo.algorithms.core.networks import LIKELIHOOD_LOG_STD, LikelihoodPolicy
 from tcmrl_algo.algorithms.core.settings import ActorCriticSettings
 from tests.commands import in_process
-from tests.made_up import ACTION_DIM, TASKS, random, steps
+from tests.made_up import TASKS, random, steps
 from tests.test_actor_critic import made, metrics_of, rows_of
-from tests.test_algorithms import LANES, STEPS, Made, act, assert_equal
 
-CONTEXT_METHODS = [
-    name
-    for name in METHODS.names()
-    if not name.startswith("double") and isinstance(Made(name).algorithm, ContextAlgorithm)
-]
 NEW_KINDS = ["iql", "bc"]
-GRADIENT_METHODS = ["corro", "pearl"]
-"""Those whose contexts learn from the critics."""
 
 
 def test_expectile_loss_weighs_targets_above_by_tau_and_below_by_the_rest() -> None:
@@ -191,44 +181,6 @@ def test_iql_learns_the_better_of_stored_actions_and_cloning_their_mean() -> Non
         chosen[kind] = actor_critic.act(plain.observations[0], torch.zeros(40, 0)).mean(dim=0)
     assert chosen["iql"][0] > 0.5 and chosen["iql"][1].abs() < 0.25
     assert chosen["bc"].abs().max() < 0.25
-
-
-@pytest.mark.parametrize("name", GRADIENT_METHODS)
-@pytest.mark.parametrize("kind", NEW_KINDS)
-def test_methods_that_learn_from_critics_learn_from_either_kind(name: str, kind: str) -> None:
-    """The actor-critic's losses alone reach the context's networks in the last stage."""
-    algorithm = Made(name, kind=kind)
-    algorithm.train(1, STEPS - 1)
-    assert isinstance(algorithm.algorithm, ContextAlgorithm)
-    learner = algorithm.algorithm.learner
-    batch = algorithm.batch(STEPS)
-    found = learner.losses(batch, STEPS, torch.Generator().manual_seed(0))
-    assert found.context is not None and found.critic_gradient
-    rows = algorithm.algorithm.actor_critic.rows(batch["policy"], found.context, critic_gradient=True)
-    total, _ = algorithm.algorithm.actor_critic.losses(rows, torch.Generator().manual_seed(0))
-    parameters = [value for value in learner.parameters() if value.requires_grad]
-    gradients = torch.autograd.grad(total, parameters, allow_unused=True)
-    assert any(gradient is not None and bool(gradient.any()) for gradient in gradients)
-
-
-@pytest.mark.parametrize(("name", "kind"), list(itertools.product(CONTEXT_METHODS, NEW_KINDS)))
-def test_a_learner_of_any_kind_goes_on_from_its_tensors_at_every_step(name: str, kind: str) -> None:
-    straight = Made(name, kind=kind)
-    assert isinstance(straight.algorithm, ContextAlgorithm)
-    assert type(straight.algorithm.actor_critic) is KINDS[kind]
-    start = straight.snapshot()
-    for step in range(1, STEPS + 1):
-        resumed = Made(name, kind=kind)
-        resumed.algorithm.load_tensors(straight.snapshot())
-        for one in (straight, resumed):
-            one.train(step, step)
-        assert_equal(straight.algorithm.tensors(), resumed.algorithm.tensors())
-    after = straight.algorithm.tensors()
-    assert any(
-        not torch.equal(value, after[key]) for key, value in start.items() if "actor_critic.policy" in key
-    )
-    actions = act(straight.adapt(LANES))
-    assert actions.shape == (2, ACTION_DIM) and abs(actions).max() <= 1
 
 
 @pytest.mark.parametrize("kind", NEW_KINDS)

@@ -25,13 +25,6 @@ Copy = Callable[[], Path]
 MAIN = "from tcmrl_cli.data import main; main()"
 
 
-def test_inspect_without_a_word_says_which_words_there_are(call: Call, tiny: Dataset) -> None:
-    measures = "quality|coverage|rewards|transfer|worth"
-    expected = f"tcmrl-data inspect returns|tasks|snapshots|episodes|{measures} {tiny.folder}"
-    assert_refused(call("inspect", tiny.folder), expected)
-    assert_refused(call("inspect", "retuns", tiny.folder), "retuns")
-
-
 def test_show_puts_a_dataset_on_one_screen(call: Call, tiny: Dataset) -> None:
     document = json.loads(call("show", tiny.folder, "--json")[1])
     counts = {key: document[key] for key in ("tasks", "train", "test", "parts", "parts_total", "episodes")}

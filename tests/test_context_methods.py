@@ -1,21 +1,16 @@
 """Methods that adapt through a context: packing, the interface of learners, FOCAL and the control."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
-import pytest
 import torch
 
 from tcmrl_algo.algorithms import controls, focal, tcmrl
-from tcmrl_algo.algorithms.core.actor_critic.base import ActorCritic
-from tcmrl_algo.algorithms.core.context import ContextAlgorithm, ContextLearner, ContextLosses, attention_of
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm, ContextLearner, attention_of
 from tcmrl_algo.algorithms.core.losses import distance_metric_loss
 from tcmrl_algo.algorithms.core.method import MethodConfig
-from tcmrl_algo.algorithms.core.networks import follow, momentum_copy
-from tcmrl_algo.algorithms.core.optimizer import Adam, ParameterGroup
 from tcmrl_algo.algorithms.core.problem import pad_trajectories
-from tcmrl_data import Batch, BatchRequest, Controller, Steps, Transitions, UniformController
+from tcmrl_data import BatchRequest, Steps, Transitions
 from tests.made_up import TASKS, batch, problem, settings, trajectory, with_steps
 
 
@@ -107,87 +102,6 @@ def test_focal_gathers_each_tasks_contexts() -> None:
     for step in range(1, 60):
         made.update(values, step)
     assert ratio() < 0.5 * before
-
-
-def test_a_learner_may_collect_and_optimise_in_its_own_way() -> None:
-    """The needs of CSRO: a network trained within `losses` and kept in checkpoints; own first episodes."""
-
-    class Own(ContextLearner):
-        latent = 0
-
-        def __init__(self) -> None:
-            super().__init__()
-            self.inner = torch.nn.Linear(1, 1)
-            self.adam = Adam(self.inner.named_parameters(), learning_rate=0.1)
-
-        def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
-            self.adam.step(self.inner.weight.sum())
-            zero = batch["policy"].rewards.new_zeros(())
-            return ContextLosses(zero, zero.new_zeros(TASKS, 0), {})
-
-        def context(self, steps: Steps) -> torch.Tensor:
-            return steps.rewards.new_zeros(len(steps.rewards), 0)
-
-        def optimizers(self) -> dict[str, Adam]:
-            return {"inner": self.adam}
-
-        def explore(self, actor_critic: ActorCritic, trajectories: Any) -> Controller:
-            return actor_critic.controller(torch.zeros(len(trajectories), 0))
-
-    method = ContextAlgorithm(problem(), settings(), learner=Own())
-    before = method.learner.inner.weight.item()
-    method.update(batch(), 1)
-    assert method.learner.inner.weight.item() == pytest.approx(before - 0.1, abs=1e-6)  # a step of its own
-    assert "optimizer/inner/weight/step" in method.tensors()
-    assert not isinstance(method.explore([[], []]), UniformController)
-
-
-class Momentum(ContextLearner):
-    """Contexts that only the critic trains, with a momentum copy of their network."""
-
-    latent = 2
-
-    def __init__(self, *, stepwise: bool = False, critic_gradient: bool = True) -> None:
-        super().__init__()
-        self.query = torch.nn.Linear(1, 2)
-        self.key = momentum_copy(self.query)
-        self.stepwise, self.critic_gradient = stepwise, critic_gradient
-
-    def losses(self, batch: Batch, step: int, generator: torch.Generator) -> ContextLosses:
-        steps = batch["context"] if self.stepwise else batch["policy"]
-        contexts = self.query(steps.rewards.unsqueeze(-1))
-        zero = contexts.new_zeros(())
-        if self.stepwise:
-            following = contexts + 1.0
-            return ContextLosses(zero, contexts, {}, following, self.critic_gradient, steps)
-        return ContextLosses(zero, contexts.mean(dim=1), {}, critic_gradient=self.critic_gradient)
-
-    def context(self, steps: Steps) -> torch.Tensor:
-        return self.query(steps.rewards.unsqueeze(-1)).mean(dim=(1, 2))
-
-    def after_step(self, step: int) -> None:
-        follow(self.key, self.query, step=0.5)
-
-    def groups(self) -> dict[str, ParameterGroup]:
-        return {"query": ParameterGroup(learning_rate=0.5)}
-
-
-@pytest.mark.parametrize("stepwise", [False, True])
-@pytest.mark.parametrize("critic_gradient", [False, True])
-def test_contexts_may_be_trained_by_the_critic_step_by_step_with_a_rate_of_their_own(
-    stepwise: bool, critic_gradient: bool
-) -> None:
-    """The needs of CORRO, PEARL and BOReL."""
-    method = ContextAlgorithm(
-        problem(), settings(), learner=Momentum(stepwise=stepwise, critic_gradient=critic_gradient)
-    )
-    before = {name: value.clone() for name, value in method.learner.state_dict().items()}
-    method.update(batch(), 1)
-    after = method.learner.state_dict()
-    moved = (after["query.weight"] - before["query.weight"]).abs().max().item()
-    assert moved == pytest.approx(0.5 if critic_gradient else 0.0, rel=1e-3)
-    torch.testing.assert_close(after["key.weight"], (before["key.weight"] + after["query.weight"]) / 2)
-    assert not [name for name in method.tensors() if name.startswith("optimizer") and ".key." in name]
 
 
 def test_attention_is_known_of_methods_that_have_it() -> None:

@@ -223,14 +223,6 @@ def test_a_dataset_without_test_tasks_has_no_controls(tiny: Dataset) -> None:
         dataset_controls(dataset)
 
 
-def test_progress_ends_at_its_total(tiny: Dataset) -> None:
-    seen: list[tuple[str, int, int]] = []
-    controls_module.measure_controls(tiny, report=lambda *arguments: seen.append(arguments))
-    assert {stage for stage, _, _ in seen} == {"controls"}
-    assert seen[-1][1] == seen[-1][2]
-    assert [done for _, done, _ in seen] == sorted(done for _, done, _ in seen)
-
-
 def test_the_command_shows_the_controls(
     tiny: Dataset, found: Controls, capsys: pytest.CaptureFixture[str], tiny_copy: Callable[[], Path]
 ) -> None:

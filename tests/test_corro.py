@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tcmrl_algo.algorithms.core.context import ContextAlgorithm, attention_of
+from tcmrl_algo.algorithms.core.context import ContextAlgorithm
 from tcmrl_algo.algorithms.core.networks import mean_representation
 from tcmrl_algo.algorithms.core.problem import StagePlan
 from tcmrl_algo.algorithms.core.settings import RunSettings
@@ -29,7 +29,6 @@ from tests.made_up import (
     problem,
     random,
     settings,
-    trajectory,
     with_steps,
 )
 from tests.small_training import small_batches
@@ -75,18 +74,6 @@ def test_contrast_by_hand() -> None:
     assert contrast(1.0, *[-1.0] * 16) == pytest.approx(3.2978e-8, rel=1e-4)
     assert contrast(1.0, *[0.0] * 16) == pytest.approx(7.2614e-4, rel=1e-4)
     assert contrast(0.0, 1.0, temperature=0.5) == pytest.approx(2.126928, rel=1e-6)  # log(1 + e^2)
-
-
-def test_contrast_of_queries_with_negatives_of_their_own_is_the_mean() -> None:
-    queries, keys, negatives = random(2, 3), random(2, 3, seed=1), random(2, 4, 3, seed=2)
-    both = relabelled_contrastive_loss(queries, keys, negatives, temperature=0.7)
-    alone = [
-        relabelled_contrastive_loss(
-            queries[i : i + 1], keys[i : i + 1], negatives[i : i + 1], temperature=0.7
-        )
-        for i in range(2)
-    ]
-    torch.testing.assert_close(both, torch.stack(alone).mean())
 
 
 def test_errors_of_outcomes_by_hand() -> None:
@@ -277,12 +264,6 @@ def test_equal_scores_make_the_aggregator_the_mean_and_others_a_softmax() -> Non
     torch.nn.init.zeros_(maker.aggregator.direction)
     even = maker.attention(steps)
     torch.testing.assert_close(even.context, mean_representation(even.representations, even.mask))
-
-
-def test_reports_know_its_attention() -> None:
-    found = attention_of(made(), [[trajectory(6, 0)], [trajectory(4, 1), trajectory(2, 2)]])
-    assert found is not None
-    torch.testing.assert_close(found.weights.sum(dim=-1), torch.ones(2))
 
 
 def test_all_stages_read_training_tasks_alone(tiny: Dataset) -> None:

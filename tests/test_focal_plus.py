@@ -84,11 +84,6 @@ def test_representations_follow_the_order_of_steps_and_no_padding(tokens: str) -
     torch.testing.assert_close(made(given[1:, :2], REAL[1:, :2]), plain[1:, :2])
 
 
-def test_a_trajectory_that_is_padding_alone_stays_finite() -> None:
-    nothing = torch.zeros(2, 5, dtype=torch.bool)
-    assert torch.isfinite(network()(values(), nothing)).all()
-
-
 def test_the_gate_is_one_weight_per_transition_between_0_and_1() -> None:
     made = TransitionGate(small(), generator=generator())
     gates = made(values() * 10)

@@ -160,28 +160,6 @@ def test_losses_and_meta_gradients_are_those_of_a_loop_over_tasks(monkeypatch: p
                 torch.testing.assert_close(own, other, rtol=1e-9, atol=1e-9)
 
 
-def test_without_rates_the_outer_losses_are_those_of_the_start() -> None:
-    made = learner()
-    for rates in (made.networks.inner.value_rates, made.networks.inner.policy_rates):
-        torch.nn.init.constant_(rates, -torch.inf)
-    _, outer = rows_of(made)
-    start = made.networks.value()
-    targets = outer.returns + outer.discounts * made.networks.values(start, outer.final_states).detach()
-    found = losses(made)
-    expected = (made.networks.values(start, outer.states) - targets).square().mean()
-    torch.testing.assert_close(found[0], expected)
-    lanes = tuple(weights.expand(3, -1) for weights in start)
-    weights = made.weights_of_rows(outer, lanes).weights
-    means = made.networks.means(made.networks.policy(), outer.states)
-    likelihoods = gaussian_log_likelihood(outer.actions, means, std=0.2)
-    expected = -(weights * likelihoods).mean()
-    torch.testing.assert_close(found[1], expected)
-    own = torch.autograd.grad(found[1], list(made.networks.policy.parameters()))
-    plain = torch.autograd.grad(expected, list(made.networks.policy.parameters()))
-    for left, right in zip(own, plain, strict=True):
-        torch.testing.assert_close(left, right)
-
-
 def test_first_order_changes_gradients_and_no_loss() -> None:
     exact, short = learner(), learner(first_order=True)
     for own, other in zip(losses(exact), losses(short), strict=True):

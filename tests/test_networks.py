@@ -48,22 +48,6 @@ def test_attention_follows_equations_2_to_5(hidden: tuple[int, ...]) -> None:
     torch.testing.assert_close(attention.context[0], weights @ representations[0])
 
 
-def test_attention_weights_sum_to_one_over_real_steps() -> None:
-    attention = extractor()(random(2, 4, 4), MASK)
-    torch.testing.assert_close(attention.weights.sum(dim=-1), torch.ones(2))
-    assert (attention.weights[~MASK] == 0).all()
-    assert (attention.weights[MASK] > 0).all()
-
-
-def test_padding_changes_no_context() -> None:
-    representations = random(2, 4, 4)
-    attention = extractor()(representations, MASK)
-    garbage = torch.where(MASK.unsqueeze(-1), representations, torch.tensor(torch.nan))
-    torch.testing.assert_close(extractor()(garbage, MASK).context, attention.context)
-    short = extractor()(representations[:1, :3], MASK[:1, :3])
-    torch.testing.assert_close(short.context, attention.context[:1])
-
-
 def test_order_of_transitions_changes_no_context() -> None:
     representations, order = random(1, 5, 4), torch.tensor([3, 0, 4, 1, 2])
     mask = torch.ones(1, 5, dtype=torch.bool)

@@ -12,13 +12,10 @@ from pathlib import Path
 import click
 import pytest
 
-from tests.chromium import chromium_or_skip, running_chromium
 from tests.page_blocks import PROGRAMS
 from tests.workers import PATIENCE, ROOT
 
 pytest.importorskip("sphinx", reason="needs the extra `docs`")
-
-OVERFLOW = "document.documentElement.scrollWidth - document.documentElement.clientWidth"
 
 pytestmark = pytest.mark.check  # imports everything, and takes 15 seconds of one core
 
@@ -66,21 +63,6 @@ def walk(path: str, command: click.Command) -> Iterator[tuple[str, click.Command
     for name, found in getattr(command, "commands", {}).items():
         yield f"{path} {name}", found
         yield from walk(f"{path} {name}", found)
-
-
-def test_pages_are_quiet_and_fit_a_telephone_in_a_browser_without_network(site: Path) -> None:
-    pages = (
-        sorted(site.glob("*.html")) + sorted(site.glob("how-to/*.html")) + sorted(site.glob("results/*.html"))
-    )
-    assert len(pages) > 15
-    with running_chromium(chromium_or_skip()) as browser:
-        for page in pages:
-            browser.open(page, width=400)
-            for width in (400, 1600):
-                browser.resize(width)
-                assert browser.evaluate(f"{OVERFLOW} <= 0"), f"{page.name} is wider than {width} pixels"
-            assert browser.evaluate("Array.from(document.images).every(i => i.naturalWidth > 0)"), page.name
-        assert (browser.problems, browser.requests) == ([], [])
 
 
 @pytest.mark.parametrize("package", ["tcmrl_data", "tcmrl_algo"])

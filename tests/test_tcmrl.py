@@ -18,7 +18,7 @@ from tcmrl_algo.algorithms.core.networks import call_frozen
 from tcmrl_algo.algorithms.tcmrl import negative_reward_loss, reverse_context, task_contrastive_loss
 from tcmrl_algo.experiment.spec import load_experiment
 from tcmrl_data import Batch, Steps
-from tests.made_up import EPISODE, TASKS, batch, problem, scramble, settings, steps, with_steps
+from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, with_steps
 
 SMALL: dict[str, Any] = {"latent": 4, "encoder_hidden": (8,), "tce_hidden": (8,), "estimator_hidden": (8,)}
 ONLY = dict.fromkeys(tcmrl.Weights.model_fields, 0.0)
@@ -167,19 +167,6 @@ def test_an_update_moves_everything_that_learns_w_included() -> None:
         assert not torch.equal(parameter, before[name]), name
 
 
-@pytest.mark.parametrize("sparse", [False, True])
-def test_padding_changes_neither_losses_nor_contexts(sparse: bool) -> None:
-    made = learner({"negative_noise": 0.0, "weights": {"orthogonality": 1.0}}, sparse=sparse)
-    plain, padded = batch(), batch()
-    padded = with_steps(padded, context=scramble(padded["context"]), execution=scramble(padded["execution"]))
-    first, second = losses_of(made, plain), losses_of(made, padded)
-    torch.testing.assert_close(first.context, second.context)
-    torch.testing.assert_close(first.total, second.total)
-    assert terms_of(first) == {
-        "positive", "negative", "sparsity", "contrastive", "distance", "orthogonality"
-    }  # fmt: skip
-
-
 def test_contexts_never_see_execution_trajectories() -> None:
     made = learner({"weights": ONLY | {"positive": 1.0}})
     plain = batch()
@@ -187,17 +174,6 @@ def test_contexts_never_see_execution_trajectories() -> None:
     first, second = losses_of(made, plain), losses_of(made, other)
     torch.testing.assert_close(first.context, second.context)
     assert first.total.item() != second.total.item()  # rewards are estimated on them
-
-
-def test_order_of_tasks_changes_no_context_and_no_loss() -> None:
-    made, order = learner({"negative_noise": 0.0}), torch.tensor([2, 0, 1])
-    plain = batch()
-
-    kinds = {kind: plain[kind].map(lambda values: values[order]) for kind in ("context", "execution")}
-    moved = with_steps(plain, **kinds)
-    first, second = losses_of(made, plain), losses_of(made, moved)
-    torch.testing.assert_close(first.context[order], second.context)
-    torch.testing.assert_close(first.total, second.total)
 
 
 def test_literal_equation_6_adds_nothing_to_any_gradient() -> None:

@@ -191,12 +191,6 @@ def test_fewer_than_two_training_tasks_are_refused(tiny: Dataset, tmp_path: Path
         train_run(lone, tmp_path / "run", config=config_of(tiny), profile="quick")
 
 
-def test_two_training_tasks_suffice(tiny: Dataset, tmp_path: Path) -> None:
-    pair = with_tasks(tiny, {task.index for task in (*tiny.train_tasks[:2], *tiny.test_tasks)})
-    report = train_run(pair, tmp_path / "run", config=config_of(tiny), profile="quick", steps=5)
-    assert report.step == 5
-
-
 def test_a_loss_that_is_not_finite_stops_with_its_name_and_step(start: Train, tmp_path: Path) -> None:
     with pytest.raises(TrainingError, match=r"is not finite at step \d+"):
         start("run", "optimizer.learning_rate=1e30", steps=50)
@@ -228,13 +222,6 @@ def test_contexts_may_come_from_other_snapshots_than_transitions(start: Train, t
         )
     }
     assert len(digests) == 4
-
-
-def test_progress_is_reported_with_rates(start: Train) -> None:
-    seen: list[TrainingProgress] = []
-    start("run", steps=25, report=seen.append)
-    assert {(progress.step, progress.steps) for progress in seen} >= {(10, 25), (20, 25), (25, 25)}
-    assert all(progress.rate > 0 and 0 <= progress.data_share <= 1 for progress in seen)
 
 
 def test_a_slow_step_is_reported_before_it_is_logged(start: Train, monkeypatch: pytest.MonkeyPatch) -> None:

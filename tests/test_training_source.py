@@ -61,9 +61,11 @@ def test_a_method_that_no_recipe_knows_gets_its_defaults(
     tiny_folder: Path, tmp_path: Path, call: Call
 ) -> None:
     out = tmp_path / "run"
-    code, _, errors = call("train", tiny_folder, "--algo", "double_gradient", "--set", STEPS, "--out", out)
+    code, _, errors = call(
+        "train", tiny_folder, "--algo", "double_stages", "--set", "run.steps=8", "--out", out
+    )
     assert code == 0, errors
-    assert "holds no [training.double_gradient] table; its values are the method's defaults" in errors
+    assert "holds no [training.double_stages] table; its values are the method's defaults" in errors
     assert open_run(out).record.config.training_source == "defaults"
 
 
