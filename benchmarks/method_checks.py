@@ -214,8 +214,8 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_grad_enabled(False)
     found: dict[str, list[Values]] = {}
-    (source,) = read_sources([arguments.results], lambda *progress: None)
-    for run in source.of(arguments.environment):
+    (source,) = read_sources([arguments.results])
+    for run in source.results(arguments.environment):
         found.setdefault(run.label, []).append(checks(run, arguments.episodes))
     means = {
         label: {name: round(fmean(one[name] for one in runs), 4) for name in runs[0]} | {"runs": len(runs)}

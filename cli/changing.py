@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING
 
 import click
 
-from tcmrl_data.foundation.errors import TierError
 from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
 
-from .frame import fail_incomplete, output_options, print_json, remark
+from .frame import output_options, print_json, remark
 from .options import (
     DATASET,
+    DATASET_PATH,
     DRY_RUN,
     INDEX,
     LABEL,
@@ -27,7 +27,6 @@ from .options import (
     allow_only,
     indices,
 )
-from .places import DATASET_PATH
 from .progress import PartsProgress, with_progress
 
 if TYPE_CHECKING:
@@ -69,14 +68,6 @@ SOURCE_RUN = click.option(
 )
 @click.option("--drop-array", "drop_arrays", multiple=True, metavar="NAME", help="Leave out an extra array.")
 @LABEL
-@click.option(
-    "--tolerance",
-    type=click.FloatRange(min=0),
-    default=15.0,
-    show_default=True,
-    help="Distance from a score of 33 up to which a snapshot counts as medium without a warning.",
-)
-@click.option("--strict", is_flag=True, help="What else is a warning is an error.")
 @DRY_RUN
 @output_options
 @click.pass_context
@@ -97,8 +88,6 @@ def derive(
     min_return: float | None,
     drop_arrays: tuple[str, ...],
     label: str | None,
-    tolerance: float,
-    strict: bool,
     dry_run: bool,
     as_json: bool,
 ) -> None:
@@ -146,17 +135,11 @@ def derive(
             min_return=min_return,
             drop_arrays=drop_arrays,
             label=label,
-            tolerance=tolerance,
-            strict=strict,
             dry_run=dry_run,
             progress=progress,
         )
 
-    try:
-        derived = with_progress(make, stage="derive", out=out or Path())
-    except TierError as error:
-        fail_incomplete(f"{error}; choose another tier, or a larger --tolerance")
-        return
+    derived = with_progress(make, stage="derive", out=out or Path())
     if derived.far_from_medium:
         remark(f"warning: not near a score of 33: {describe_far(derived.far_from_medium)}")
     _print([derived], as_json=as_json, dry_run=dry_run)

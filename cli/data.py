@@ -27,8 +27,7 @@ from .keeping import cache, delete, verify
 from .looking import dataset_report, diff, render
 from .making import build, import_data, import_policy
 from .new import new
-from .options import DATASET
-from .places import DATASET_PATH
+from .options import DATASET, DATASET_PATH
 from .remote import pull, push
 from .sharing import card, export
 

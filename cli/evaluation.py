@@ -8,7 +8,6 @@ import click
 
 from .frame import footnotes, make_table, number, output_options, print_json, print_table, remark
 from .options import ALL_PROTOCOLS, COUNT, DATASET, FILE, INDEX, PATH, PROTOCOL_OR_ALL
-from .places import RUN_PATH
 from .progress import StageProgress
 
 if TYPE_CHECKING:
@@ -87,7 +86,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
 
 
 @click.command()
-@click.argument("run_folder", metavar="RUN", type=RUN_PATH)
+@click.argument("run_folder", metavar="RUN", type=PATH)
 @click.option(
     "--protocol",
     type=PROTOCOL_OR_ALL,

@@ -37,8 +37,8 @@ from .options import (
     TRAINING_SETTINGS,
     WORKERS,
     ManyNames,
+    names_or_files,
 )
-from .places import complete_experiments
 from .progress import StageProgress
 
 if TYPE_CHECKING:
@@ -49,8 +49,14 @@ if TYPE_CHECKING:
 NUM_SEEDS = 10_000
 
 
+def _shipped_names() -> list[str]:
+    from tcmrl_algo import experiment_names
+
+    return experiment_names()
+
+
 @click.command()
-@click.argument("name", metavar="FILE|NAME", required=False, shell_complete=complete_experiments)
+@click.argument("name", metavar="FILE|NAME", required=False, shell_complete=names_or_files(_shipped_names))
 @click.option("--list", "as_list", is_flag=True, help="List the experiments of this package.")
 @click.option(
     "--out", type=PATH, metavar="FOLDER", show_default="results/NAME", help="Folder of the results."
@@ -90,13 +96,6 @@ NUM_SEEDS = 10_000
     metavar="TUNINGS",
     help="Take the best settings of the tunings in a folder, each in ENV-ALGO, or in a table of them.",
 )
-@click.option(
-    "--reuse",
-    type=PATH,
-    multiple=True,
-    metavar="RESULTS",
-    help="Take over equal trainings of another results folder; repeatable.",
-)
 @DEVICE
 @output_options
 def experiment(
@@ -112,7 +111,6 @@ def experiment(
     profile: Profile | None,
     build: bool,
     tuned: Path | None,
-    reuse: tuple[Path, ...],
     device: str,
     as_json: bool,
 ) -> None:
@@ -122,8 +120,7 @@ def experiment(
     starts; if datasets are missing, the commands that build them are printed, or --build runs them. With
     --profile, the steps that the file sets give way to the profile's. If the same command is run again, it
     keeps finished runs and continues interrupted runs from their last checkpoint; the results are those of
-    uninterrupted runs. The workers share the cores. With --reuse, a method that another experiment trained
-    with the same data, seed and settings is only evaluated, where that experiment did not.
+    uninterrupted runs. The workers share the cores.
 
     The results folder contains a JSON document per run in runs/, and table.csv. Returns are undiscounted.
 
@@ -133,7 +130,7 @@ def experiment(
       tcmrl experiment tour --workers 2
       tcmrl experiment window_length --steps 1000 --out results/short
       tcmrl experiment negative_rewards --profile paper --build
-      tcmrl experiment table2 --tuned tuning --reuse results/table1
+      tcmrl experiment table2 --tuned tuning
       tcmrl experiment mine.toml --data /disk/datasets --only TCMRL
     """
     from tcmrl_algo import load_experiment, run_experiment
@@ -166,7 +163,6 @@ def experiment(
             workers=workers,
             device=device,
             tuned=settings,
-            reuse=reuse,
             report=lambda *ended: remark(_run_line(*ended)),
         )
     if as_json:

@@ -286,7 +286,7 @@ def delete(dataset: Path, yes: bool, dry_run: bool, as_json: bool) -> None:
 
 @click.group(cls=Commands)
 def cache() -> None:
-    """List, check or clear the cache of decoded steps.
+    """List or clear the cache of decoded steps.
 
     Training reads data that do not fit in memory from this cache. The environment variable TCMRL_CACHE
     names its folder (default: tcmrl in the user's cache folder), and TCMRL_CACHE_LIMIT limits its size
@@ -296,7 +296,6 @@ def cache() -> None:
     \b
     Examples:
       tcmrl-data cache list
-      tcmrl-data cache verify
       tcmrl-data cache clear
     """
 
@@ -327,40 +326,6 @@ def list_cache(as_json: bool) -> None:
         state = "in use" if entry.in_use else ""
         cells.append((entry.key[:12], entry.environment, entry.dataset, *numbers, used, state))
     print_rows(title, [*texts[:3], *counts, *texts[3:]], cells, text=texts)
-
-
-@click.command(name="verify")
-@output_options
-def verify_cache(as_json: bool) -> None:
-    """Hash all entries, and remove those that are damaged.
-
-    A run that opens an entry hashes it if it takes up to 1 GB; this command hashes larger entries too. The
-    exit code is 1 if an entry is damaged; the next run that needs it decodes it again.
-
-    \b
-    Example:
-      tcmrl-data cache verify
-    """
-    import tcmrl_data
-
-    checked = tcmrl_data.list_cache()
-    damaged = tcmrl_data.verify_cache()
-    kept = {entry.key for entry in tcmrl_data.list_cache()}
-    if as_json:
-        rows = [
-            dataclasses.asdict(entry) | {"problem": problem, "removed": entry.key not in kept}
-            for entry, problem in damaged
-        ]
-        print_json({"checked": len(checked), "damaged": rows})
-    else:
-        for entry, problem in damaged:
-            state = "kept, because it is in use" if entry.key in kept else "removed"
-            click.echo(f"{entry.key[:12]}: {problem}; {state}")
-        click.echo(
-            f"{len(checked)} entries, {size(sum(entry.bytes for entry in checked))}: {len(damaged)} damaged"
-        )
-    if damaged:
-        fail_incomplete(f"{len(damaged)} of {len(checked)} entries are damaged")
 
 
 @click.command(name="clear")
@@ -394,4 +359,4 @@ def clear_cache(fetched: bool, as_json: bool) -> None:
         remark(f"{len(kept)} entries kept, because they are in use")
 
 
-cache.fill({"Commands": [list_cache, verify_cache, clear_cache]})
+cache.fill({"Commands": [list_cache, clear_cache]})

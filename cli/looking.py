@@ -11,8 +11,7 @@ from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
 
 from .frame import INCOMPLETE, number, output_options, print_json, remark, stopped_by_signals
-from .options import DATASET, FILE, INDEX
-from .places import DATASET_PATH, beside
+from .options import DATASET, DATASET_PATH, FILE, INDEX, beside
 from .progress import StageProgress
 
 if TYPE_CHECKING:

@@ -13,6 +13,7 @@ import click
 from tcmrl_data.foundation.errors import TcmrlError
 from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import available_cores, size
+from tcmrl_data.foundation.plugins import declared_names
 from tcmrl_data.recipe import PROFILES, Profile
 
 from .frame import (
@@ -40,8 +41,8 @@ from .options import (
     READER_NAME,
     WORKERS,
     allow_only,
+    names_or_files,
 )
-from .places import complete_environments, complete_recipe_keys
 from .progress import StageProgress, with_progress
 
 if TYPE_CHECKING:
@@ -53,7 +54,11 @@ BUSY_SHARE = 0.25
 
 
 @click.command()
-@click.argument("name_or_file", metavar="ENV|FILE", shell_complete=complete_environments)
+@click.argument(
+    "name_or_file",
+    metavar="ENV|FILE",
+    shell_complete=names_or_files(lambda: declared_names("tcmrl.environments")),
+)
 @click.option(
     "--profile",
     type=click.Choice(PROFILES),
@@ -66,7 +71,6 @@ BUSY_SHARE = 0.25
 @click.option(
     "--set",
     "overrides",
-    shell_complete=complete_recipe_keys,
     metavar="SECTION.KEY=VALUE",
     multiple=True,
     help="Override a value of the recipe; repeatable.",

@@ -135,27 +135,11 @@ def quality(dataset: Path, as_json: bool, plot: Path | None) -> None:
 @DATASET
 @output_options
 @PLOT
-@click.option(
-    "--cell",
-    type=click.FloatRange(min=0, min_open=True),
-    default=0.5,
-    show_default=True,
-    metavar="WIDTH",
-    help="Width of a cell in standard deviations.",
-)
-@click.option(
-    "--max-tasks",
-    type=COUNT,
-    default=20,
-    show_default=True,
-    metavar="N",
-    help="Tasks in the matrix of overlaps, evenly spread; --json has it.",
-)
-def coverage(dataset: Path, as_json: bool, plot: Path | None, cell: float, max_tasks: int) -> None:
+def coverage(dataset: Path, as_json: bool, plot: Path | None) -> None:
     """Print state-action coverage by snapshot, beside trajectory quality.
 
     SACo (arXiv 2111.04714) is the number of different state-action cells of a part, as a share of the cells
-    of all parts of its task. Cells form a fixed grid in units of the dataset's standard deviations. With
+    of all parts of its task. Cells form a fixed grid of half of the dataset's standard deviations. With
     many columns nearly every step has a cell of its own, and SACo only tells the number of steps.
 
     \b
@@ -168,9 +152,7 @@ def coverage(dataset: Path, as_json: bool, plot: Path | None, cell: float, max_t
 
     opened = tcmrl_data.open_dataset(dataset)
     run_measure(
-        lambda progress: tcmrl_data.measure_coverage(
-            opened, cell=cell, overlap_tasks=max_tasks, progress=progress("reading")
-        ),
+        lambda progress: tcmrl_data.measure_coverage(opened, progress=progress("reading")),
         _print_coverage,
         plot_coverage,
         as_json=as_json,
@@ -182,8 +164,7 @@ def coverage(dataset: Path, as_json: bool, plot: Path | None, cell: float, max_t
 @DATASET
 @output_options
 @PLOT
-@click.option("--bins", type=COUNT, default=40, show_default=True, help="Bins of the histograms.")
-def rewards(dataset: Path, as_json: bool, plot: Path | None, bins: int) -> None:
+def rewards(dataset: Path, as_json: bool, plot: Path | None) -> None:
     """Print how often stored rewards are zero, and their distribution.
 
     An episode is silent if all its rewards are zero: it tells nothing of the task, except where the reward
@@ -199,7 +180,7 @@ def rewards(dataset: Path, as_json: bool, plot: Path | None, bins: int) -> None:
 
     opened = tcmrl_data.open_dataset(dataset)
     run_measure(
-        lambda progress: tcmrl_data.measure_rewards(opened, bins=bins, progress=progress("reading")),
+        lambda progress: tcmrl_data.measure_rewards(opened, progress=progress("reading")),
         _print_rewards,
         plot_rewards,
         as_json=as_json,
@@ -294,7 +275,6 @@ PLAYED_SEED = click.option(
 @MAX_TASKS
 @PLAYED_EPISODES
 @PLAYED_SEED
-@click.option("--deterministic", is_flag=True, help="Let policies act without their noise.")
 def transfer(
     dataset: Path,
     as_json: bool,
@@ -302,7 +282,6 @@ def transfer(
     max_tasks: int | None,
     episodes: int,
     seed: int,
-    deterministic: bool,
 ) -> None:
     """Let the last policy of every task act in every task, and print what it gets.
 
@@ -324,7 +303,6 @@ def transfer(
             tasks=max_tasks,
             episodes=episodes,
             seed=seed,
-            deterministic=deterministic,
             progress=progress("playing"),
         ),
         _print_transfer,
@@ -341,14 +319,6 @@ def transfer(
 @MAX_TASKS
 @PLAYED_EPISODES
 @PLAYED_SEED
-@click.option(
-    "--transitions",
-    type=click.IntRange(min=5),
-    default=500,
-    show_default=True,
-    metavar="N",
-    help="Most transitions of a part that are predicted, and most that predict.",
-)
 def worth(
     dataset: Path,
     as_json: bool,
@@ -356,7 +326,6 @@ def worth(
     max_tasks: int | None,
     episodes: int,
     seed: int,
-    transitions: int,
 ) -> None:
     """Print whether a context is worth having, before anyone trains.
 
@@ -366,10 +335,8 @@ def worth(
     neighbours of observation and action) from other episodes of the same task than from other tasks:
     1 is plain to see, 0 is invisible.
 
-    Weak spots: a learner without context may do better than the best stored policy, so that worth is an
-    upper bound; poor policies of a task's own make it low. Constant rewards have no visibility (–). Where
-    policies are narrow, visibility in dynamics mixes the task with the coverage. What only a sequence of
-    transitions tells is not seen.
+    Worth is an upper bound: a learner without context may do better than the best stored policy. Constant
+    rewards have no visibility (–).
 
     \b
     Examples:
@@ -386,7 +353,6 @@ def worth(
             tasks=max_tasks,
             episodes=episodes,
             seed=seed,
-            transitions=transitions,
             progress=lambda stage, done, total: progress(stage)(done, total),
         ),
         _print_worth,

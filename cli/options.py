@@ -1,18 +1,17 @@
 """Options that several commands take alike, and the types of their values."""
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, final
+from typing import TYPE_CHECKING, Any, final
 
 import click
 from click.shell_completion import CompletionItem
 
 from tcmrl_data.recipe import PROFILES
 
-from .places import DATASET_PATH, complete_training_keys
-
-Command = TypeVar("Command", bound=Callable[..., Any])
+if TYPE_CHECKING:
+    from tcmrl_data import Address
 
 TIERS = ("random", "medium", "medium-replay", "expert", "medium-expert", "random-expert", "mixed")
 ALL_PROTOCOLS = "all"
@@ -48,7 +47,7 @@ class PluginName(click.ParamType):  # type: ignore[type-arg] # generic in newer 
     def shell_complete(
         self, ctx: click.Context, param: click.Parameter, incomplete: str
     ) -> list[CompletionItem]:
-        return [CompletionItem(name) for name in self.known() if name.startswith(incomplete)]
+        return [CompletionItem(name) for name in _starting(self.known(), incomplete)]
 
     def known(self) -> list[str]:
         """The names that can be given."""
@@ -92,21 +91,19 @@ class WrittenFile(click.Path):
         return file
 
 
+@final
+class DatasetPath(click.Path):
+    """The folder of a dataset, a view's file, or an address, which is text."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        return value if isinstance(value, str) and "://" in value else super().convert(value, param, ctx)
+
+
+DATASET_PATH = DatasetPath(path_type=Path)
 PATH = click.Path(path_type=Path)
 FILE = WrittenFile()
 COUNT = click.IntRange(min=1)
 INDEX = click.IntRange(min=0)
-
-
-def with_options(*decorators: Callable[[Command], Command]) -> Callable[[Command], Command]:
-    """Adds several arguments and options to a command, in this order."""
-
-    def add(command: Command) -> Command:
-        for decorator in reversed(decorators):
-            command = decorator(command)
-        return command
-
-    return add
 
 
 DATASET = click.argument("dataset", type=DATASET_PATH)
@@ -137,7 +134,6 @@ TRAINING_PROFILE = click.option(
 TRAINING_SETTINGS = click.option(
     "--set",
     "overrides",
-    shell_complete=complete_training_keys,
     metavar="SECTION.KEY=VALUE",
     multiple=True,
     help="Override a training setting; repeatable.",
@@ -167,3 +163,25 @@ def indices(text: str | None, option: str = "--tasks") -> list[int] | None:
     from tcmrl_data import MAX_TASKS, parse_indices
 
     return None if text is None else parse_indices(text, MAX_TASKS, option=option)
+
+
+def beside(place: "Path | Address", ending: str) -> Path:
+    """The path of something made of a dataset: beside it, or in the current folder if it is at an address."""
+    if not isinstance(place, Path):
+        return Path(f"{place.name}{ending}")
+    place = place if place.name not in ("", "..") else place.resolve()
+    return place.with_name(f"{place.stem if place.is_file() else place.name}{ending}")
+
+
+def names_or_files(known: Callable[[], Iterable[str]]) -> Callable[..., list[CompletionItem]]:
+    """What completes an argument that is a name or a file."""
+
+    def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[CompletionItem]:
+        names = [CompletionItem(name) for name in _starting(known(), incomplete)]
+        return names or [CompletionItem(incomplete, type="file")]
+
+    return complete
+
+
+def _starting(names: Iterable[str], incomplete: str) -> list[str]:
+    return sorted(name for name in names if name.startswith(incomplete))

@@ -9,17 +9,16 @@ import click
 
 from .frame import number, output_options, print_json, print_rows, remark
 from .options import PATH
-from .places import RUN_PATH
 from .progress import StageProgress
 
 
 @click.command()
-@click.argument("runs", metavar="RUNS...", nargs=-1, required=True, type=RUN_PATH)
+@click.argument("runs", metavar="RUNS...", nargs=-1, required=True, type=PATH)
 @click.option(
     "--out",
     type=PATH,
     metavar="FOLDER",
-    show_default="report in the first of RUNS; of an earlier report itself; of a table its folder",
+    show_default="report in the first of RUNS; of a table its folder",
     help="Folder of the report.",
 )
 @click.option(
@@ -40,19 +39,15 @@ from .progress import StageProgress
 def report(
     runs: tuple[Path, ...], out: Path | None, rows: Path | None, datasets: tuple[Path, ...], as_json: bool
 ) -> None:
-    """Write a report on finished runs.
+    """Write a report on experiments.
 
-    RUNS are results folders of `tcmrl experiment`, run folders of `tcmrl train`, or earlier reports.
+    RUNS are results folders of `tcmrl experiment`.
 
-    report.md contains final returns, learning curves, t-SNE plots of contexts, attention weights, time
-    and memory, the returns of the dataset, the paper's numbers that have the same unit, and a verdict on
-    every claim of an experiment under every protocol: supported, contradicted, or cannot tell, after a
-    correction for the number of verdicts. From five runs on, 95% intervals are printed; with fewer, the
-    values of all. report.html is the same report in one file with its figures in it. Every table is also
-    written as a CSV file and every figure as a PNG file. Run folders are evaluated first.
-
-    Beside the report stand a small JSON document per run and what was measured of checkpoints and
-    datasets. They are enough to write the same report again, elsewhere and later.
+    report.md contains final returns, learning curves, t-SNE plots of contexts, attention weights, time and
+    memory, returns of the dataset, and a verdict on every claim under every protocol: supported,
+    contradicted, or cannot tell, corrected for the number of verdicts. From five runs on, 95% intervals are
+    printed; with fewer, the values of all. report.html is the same in one file with its figures. Every table
+    is also a CSV file and every figure a PNG file.
 
     With --rows, a table of results gets a row per run and protocol, under the name of the results folder;
     rows of the same runs are replaced. Tunings of `tcmrl tune` (folders) and documents of
@@ -67,7 +62,6 @@ def report(
     Examples:
       tcmrl report results/perspectives
       tcmrl report results/perspectives results/window_length --out both
-      tcmrl report runs/point-robot-tcmrl-seed0 --out report
       tcmrl report results/perspectives --dataset /disk/point-robot
       tcmrl report results/perspectives --rows results/runs.csv
       tcmrl report tuning/point-robot-tcmrl --rows results/tuning.csv
@@ -84,7 +78,7 @@ def report(
     with StageProgress() as progress:
         written = write_report(
             runs,
-            out or _default_out(runs[0]),
+            out or runs[0] / "report",
             datasets=datasets,
             rows=rows,
             report=lambda stage, done, total: progress.update(stage, done=done, total=total, unit="parts"),
@@ -123,10 +117,6 @@ def _add(sources: tuple[Path, ...], rows: Path, *, as_json: bool) -> None:
         print_json({"table": str(rows), "rows": added})
     else:
         click.echo(f"{rows}: {added} rows written")
-
-
-def _default_out(folder: Path) -> Path:
-    return folder if (folder / "report.md").is_file() else folder / "report"
 
 
 @click.command()

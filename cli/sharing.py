@@ -9,8 +9,19 @@ from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
 
 from .frame import QUIET_OPTION, output_options, print_json, remark
-from .options import DATASET, DRY_RUN, FILE, FORMAT_NAME, PATH, SNAPSHOTS, SPLIT, TASKS, TIER, indices
-from .places import beside
+from .options import (
+    DATASET,
+    DRY_RUN,
+    FILE,
+    FORMAT_NAME,
+    PATH,
+    SNAPSHOTS,
+    SPLIT,
+    TASKS,
+    TIER,
+    beside,
+    indices,
+)
 from .progress import PartsProgress, with_progress
 
 if TYPE_CHECKING:

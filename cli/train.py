@@ -33,7 +33,6 @@ from .options import (
     TRAINING_SETTINGS,
     ManyNames,
 )
-from .places import RUN_FILE
 from .progress import StageProgress
 from .reports import report, runs
 
@@ -141,7 +140,7 @@ def train(
     limit = parse_bytes(memory_limit) if memory_limit else None
     if resume and not dataset.exists():
         raise click.ClickException(f"{dataset} does not exist; name the present folder of the run's dataset")
-    if (dataset / RUN_FILE).is_file():
+    if (dataset / "run.json").is_file():
         raise click.ClickException(
             f"{dataset} is a run, not a dataset; to continue it, run `tcmrl train DATASET --resume --out "
             f"{shlex.quote(str(dataset))}`"

@@ -7,6 +7,7 @@ from typing import Any
 from tcmrl_algo import TrainingConfig, resolve, run_experiment, write_report
 from tcmrl_algo.experiment.results import CurvePoint, RunResult
 from tcmrl_algo.experiment.spec import read_experiment, run_id
+from tcmrl_algo.report.write import Page, compose, measure_paths
 from tcmrl_data import load_recipe
 from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.records import write_record
@@ -113,8 +114,8 @@ def write_results(folder: Path, content: dict[str, Any], results: list[RunResult
     return folder
 
 
-def made_report(folder: Path) -> Path:
-    """The report of an experiment of two methods and five seeds that never was."""
+def made_report(folder: Path) -> Page:
+    """The report, with its figures, on an experiment of two methods and five seeds that never was."""
     content = tables(folder, seeds=[0, 1, 2, 3, 4], protocols=["offline"])
     finals = {"TCMRL": [1.0, 2.0, 3.0, 4.0, 5.0], "no context": [0.0, 0.5, 0.25, 0.0, 0.125]}
     shared: dict[str, Any] = {
@@ -134,7 +135,9 @@ def made_report(folder: Path) -> Path:
         for method, values in finals.items()
         for seed, final in enumerate(values)
     ]
-    return write_report([write_results(folder / "made", content, results)], folder / "report").report.parent
+    made, out = write_results(folder / "made", content, results), folder / "report"
+    write_report([made], out)
+    return compose(measure_paths([made]), out)[0]
 
 
 def run_small(dataset: Path, out: Path) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import tcmrl_data
-from tcmrl_algo.report.write import compose, measure_paths, page_html
+from tcmrl_algo.report.write import page_html
 from tests.chromium import Chromium, chromium_or_skip, running_chromium
 from tests.experiments import made_report
 
@@ -94,8 +94,7 @@ def assert_moves(browser: Chromium, slider: str) -> None:
 
 
 def test_a_report_of_results(browser: Chromium, tmp_path: Path) -> None:
-    folder = made_report(tmp_path)
-    page, _ = compose(measure_paths([folder]), folder)
+    page = made_report(tmp_path)
     file = tmp_path / "report.html"
     file.write_text(page_html(page), encoding="utf-8")
     browser.open(file)

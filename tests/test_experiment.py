@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from tcmrl_cli.experiments import result_tables
-from tcmrl_cli.frame import print_table
 from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
@@ -100,34 +98,6 @@ def test_tables_by_protocol_fit_a_terminal_with_every_number_whole(
             values = [[row[part] for row in rows if row["method"] == method] for part in PARTS]
             means = [f"{sum(found) / len(found):,.2f}" for found in values]
             assert [*method.split(), "2", means[0], "–", *means[1:]] in lines
-
-
-def test_long_returns_with_intervals_fit_a_terminal(
-    finished: Path,
-    tiny_folder: Path,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    (result, *_) = read_results(finished, _small(tiny_folder))
-    far = {"mean_final": -12345.67, "mean_shuffled": -54321.09, "mean_regret": 98765.43}
-    runs = [
-        result.model_copy(
-            update={
-                "method": "TCMRL without anything that the paper adds to its predecessors",
-                "seed": seed,
-                "privileged": True,
-                "evaluations": {"a_new_protocol": result.evaluations["paper"] | far},
-            }
-        )
-        for seed in range(5)
-    ]
-    (table,) = result_tables("point-robot", runs)
-    monkeypatch.setattr("tcmrl_cli.frame.PIPE_WIDTH", 80)
-    print_table(table)
-    output = capsys.readouterr().out
-    assert_fits(output)
-    assert "(privileged)" in output
-    assert "-12,345.7 to -12,345.7" in output and "-54,321.1" in output and "98,765.4" in output
 
 
 def test_other_settings_or_data_are_refused_by_name(
@@ -337,11 +307,6 @@ def test_a_stopped_experiment_leaves_no_process_and_ends_as_if_never_stopped(
     straight = train_run(dataset, tmp_path / "straight", config=resumed.config, profile="quick", seed=1)
     assert resumed.digest == straight.digest
     assert [point.step for point in resumed.curve] == [20, 40]
-
-
-def test_a_missing_experiment_attribute_is_named() -> None:
-    with pytest.raises(TrainingError, match="title"):
-        read_experiment({"schema": 1, "name": "x"}, place="here")
 
 
 def test_points_of_a_curve_name_the_stage_they_lie_in(tiny_folder: Path, tmp_path: Path) -> None:

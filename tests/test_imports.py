@@ -36,7 +36,7 @@ SLOW = HEAVY | {"gymnasium", "numpy", "pydantic"}
 
 COMPLETIONS = (
     "tcmrl-data show da",
-    "tcmrl-data build point-robot --set r",
+    "tcmrl-data build point",
     "tcmrl train --algo t",
 )
 HELPS = ("tcmrl-data --help", "tcmrl-data build --help", "tcmrl train --help", "tcmrl evaluate --help")

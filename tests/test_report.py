@@ -11,11 +11,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 from tcmrl_cli.train import tcmrl
 
-import tcmrl_data
-from tcmrl_algo import WrittenReport, open_run, run_experiment, write_report
+from tcmrl_algo import WrittenReport, run_experiment, write_report
 from tcmrl_algo.experiment.results import RunResult, read_result
 from tcmrl_algo.experiment.spec import read_experiment
 from tcmrl_algo.report.contexts import (
@@ -23,19 +21,14 @@ from tcmrl_algo.report.contexts import (
     TrainedContexts,
     centroid_accuracy,
     distance_ratio,
-    embed,
 )
 from tcmrl_algo.report.figures import draw_embeddings
-from tcmrl_algo.report.sources import labels_of, read_sources
 from tcmrl_algo.report.tables import (
     Table,
     across_seeds,
     attention_table,
     final_table,
-    published,
-    published_table,
 )
-from tcmrl_algo.report.write import compose, measure_paths
 from tcmrl_data import Dataset
 from tcmrl_data.foundation.records import read_record
 from tests import experiments
@@ -82,17 +75,6 @@ def test_a_context_is_not_counted_into_the_centroid_that_it_is_compared_with() -
     assert centroid_accuracy(contexts[:3], labels[:3]) is None
 
 
-def test_tsne_keeps_far_groups_apart_and_repeats_itself() -> None:
-    random = np.random.default_rng(0)
-    groups = np.repeat([[0.0], [50.0]], 20, axis=0) + random.normal(size=(40, 3))
-    points = embed(groups.astype(np.float32))
-    assert points.shape == (40, 2)
-    first, second = points[:20], points[20:]
-    apart = np.linalg.norm(first.mean(axis=0) - second.mean(axis=0))
-    assert apart > 2 * max(first.std(), second.std())
-    assert np.array_equal(points, embed(groups.astype(np.float32)))
-
-
 def test_methods_may_have_different_numbers_of_contexts(tmp_path: Path) -> None:
     points = {"few": np.zeros((2, 2), dtype=np.float32), "many": np.ones((4, 2), dtype=np.float32)}
     labels = {"few": np.array([0, 1]), "many": np.array([0, 0, 1, 1])}
@@ -112,7 +94,7 @@ def test_attention_is_relative_and_makes_the_context(trained: RunResult, tiny: D
     assert (len(weights.zero), len(weights.nonzero)) == (0, 0)  # no dense reward is zero
     measured = trained.model_copy(update={"contexts": found.measures()})
     assert measured.contexts is not None and measured.contexts.tasks == len(stored.tasks)
-    assert attention_table("a", "point-robot", [measured]) is None
+    assert attention_table("a", [measured]) is None
     assert found.contexts is not None and found.contexts.shape == (len(stored.lanes), 4)
 
 
@@ -131,10 +113,9 @@ def test_weights_of_rewarded_transitions_are_told_apart(trained: RunResult, tiny
     total = weights.zero.sum() + weights.nonzero.sum()
     assert total == pytest.approx(len(trajectory), abs=1e-4)
     measured = trained.model_copy(update={"contexts": found.measures()})
-    table = attention_table("a", "sparse-point-robot", [measured])
+    table = attention_table("a", [measured])
     assert table is not None
     assert [row[1] for row in table.rows] == ["nonzero reward", "zero reward"]
-    assert table.rows[0][-2:] == (0.0009839126, 0.0009260265)
 
 
 def test_intervals_need_five_seeds() -> None:
@@ -154,21 +135,6 @@ def test_tables_are_markdown_and_csv() -> None:
         "| – | 12,346 |",
     ]
     assert list(csv.reader(table.csv().splitlines())) == [["a|b", "c"], ["x|y", "1.23456"], ["", "12345.6"]]
-
-
-def test_the_paper_stands_beside_ours_where_the_unit_is_the_same(trained: RunResult) -> None:
-    assert published_table("p", "point-robot", [trained]) is None
-    assert published_table("p", "ml1/reach", [trained]) is None
-    ours = trained.model_copy(update={"method": "a method of ours"})
-    assert published_table("p", "half-cheetah-vel", [ours]) is None
-    table = published_table("p", "half-cheetah-vel", [trained])
-    assert table is not None
-    rows = {row[0]: row for row in table.rows}
-    assert rows["TCMRL"][1] == "-79.7 ± 11.3"
-    assert rows["TCMRL"][2] == trained.evaluations["offline"]["mean_final"]
-    assert rows["IDAQ"][2:] == (None,) * (len(table.columns) - 2)
-    known = {row["name"] for row in tcmrl_data.list_environments().environments}
-    assert set(published()["returns"]) <= known
 
 
 def test_a_report_holds_every_section_and_every_file_it_names(report: WrittenReport, results: Path) -> None:
@@ -197,20 +163,8 @@ def test_dataset_returns_are_those_of_its_parts(report: WrittenReport, tiny: Dat
     (file,) = (path for path in report.files if path.name.endswith("-dataset.csv"))
     rows = {row["snapshot"]: row for row in csv.DictReader(file.read_text().splitlines())}
     means = [tiny.part(task.index, 150).statistics.mean for task in tiny.train_tasks]
-    assert float(rows["150"]["training tasks"]) == float(f"{np.mean(means):.6g}")
+    assert float(rows["150"]["training tasks"]) == pytest.approx(np.mean(means))
     assert list(rows) == ["0", "100", "150", "all"]
-
-
-@pytest.mark.check
-def test_the_command_writes_reports_on_results_and_on_runs(results: Path, tmp_path: Path, call: Call) -> None:
-    run = results / "runs/point-robot--tcmrl--seed0"
-    code, output, _ = call("report", run, "--out", tmp_path / "runs", "--json", "--quiet")
-    document = json.loads(output)
-    assert code == 0
-    assert document["report"] == str(tmp_path / "runs/report.md")
-    text = (tmp_path / "runs/report.md").read_text()
-    assert "Single runs" in text and "| idaq | tcmrl | 1 |" in text
-    assert "Learning curves" not in text
 
 
 @pytest.fixture
@@ -253,69 +207,12 @@ def test_a_report_names_the_runs_that_are_missing_and_why(copy: Path) -> None:
     assert [verdict.pairs for verdict in report.verdicts] == [(), (), ()]  # no run, no checkpoint
 
 
-def _texts(folder: Path) -> dict[str, bytes]:
-    files = [file for file in folder.rglob("*") if file.is_file() and file.suffix != ".png"]
-    return {str(file.relative_to(folder)): file.read_bytes() for file in files}
-
-
-def test_a_report_is_made_again_from_what_stands_beside_it(report: WrittenReport, tmp_path: Path) -> None:
-    moved = tmp_path / "moved"
-    shutil.copytree(report.report.parent, moved)
-    before = _texts(moved)
-    page, judged = compose(measure_paths([moved]), moved)
-    assert page.markdown() == report.report.read_text()
-    assert {f"{table.name}.csv": table.csv().encode() for table in page.tables}.items() <= before.items()
-    assert tuple(judged["small"]) == report.verdicts
-    written = write_report([moved], moved)
-    assert _texts(moved) == before
-    assert {file.name for file in written.files} == {file.name for file in report.files}
-
-
-def test_committed_results_are_small_and_name_no_path(report: WrittenReport, trained: RunResult) -> None:
-    file = report.report.parent / "runs/point-robot--tcmrl--seed0.json"
-    result = read_record(RunResult, file)
-    assert file.stat().st_size < 6_000
-    assert (result.dataset, result.identity) == ("", {})
-    assert result == result.compact()
-    assert result.contexts is not None and result.contexts.context_ratio is not None
-    for protocol, evaluation in result.evaluations.items():
-        exact = trained.evaluations[protocol]["mean_final"]
-        assert evaluation["mean_final"] == float(f"{exact:.6g}")
-        assert "returns" not in evaluation["tasks"][0]
-    for path in report.files:
-        if path.suffix != ".png":
-            assert trained.dataset not in path.read_text()
-
-
 def test_what_is_no_run_is_refused(results: Path, tmp_path: Path, call: Call) -> None:
-    assert_refused(call("report", tmp_path), "experiment.json", "run.json")
+    assert_refused(call("report", tmp_path), "experiment.json")
     shutil.copy(results / "experiment.json", tmp_path)
     assert_refused(call("report", tmp_path), "no finished run")
     (tmp_path / "experiment.json").write_text("{")
     assert_refused(call("report", tmp_path), "experiment.json")
-
-
-def test_runs_of_one_algorithm_with_other_settings_are_told_apart(results: Path, tmp_path: Path) -> None:
-    first = results / "runs/point-robot--tcmrl--seed0"
-    other = tmp_path / "other"
-    shutil.copytree(first, other)
-    record = json.loads((other / "run.json").read_text())
-    record["config"]["settings"]["run"]["episodes"] = 3
-    (other / "run.json").write_text(json.dumps(record))
-    (source,) = read_sources([first, other], None)
-    assert list(source.experiment.methods) == [f"tcmrl {first.name}", "tcmrl other"]
-    second = tmp_path / "second"
-    for field, value, labels in (
-        ("seed", 1, ["tcmrl"]),
-        ("root", "0" * 64, [f"tcmrl {first.name}", "tcmrl second"]),
-    ):
-        record = json.loads((first / "run.json").read_text()) | {"seed": 1, field: value}
-        shutil.copytree(first, second, dirs_exist_ok=True)
-        (second / "run.json").write_text(json.dumps(record))
-        assert list(dict.fromkeys(labels_of([open_run(first), open_run(second)]))) == labels
-    torch.testing.assert_close(
-        open_run(first).newest().tensors(), open_run(other).newest().tensors(), rtol=0, atol=0
-    )
 
 
 @pytest.mark.check

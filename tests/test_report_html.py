@@ -5,15 +5,14 @@ import re
 from pathlib import Path
 
 from tcmrl_algo.report.tables import Table
-from tcmrl_algo.report.write import Page, compose, measure_paths, page_html
+from tcmrl_algo.report.write import Page, page_html
 from tests.experiments import made_report
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 
 
 def test_the_page_says_what_the_markdown_says(tmp_path: Path) -> None:
-    folder = made_report(tmp_path)
-    page, _ = compose(measure_paths([folder]), folder)
+    page = made_report(tmp_path)
     made = page_html(page)
     text = html.unescape(re.sub(r"<[^>]+>", "", made))
     words = "".join(text.split())
@@ -39,7 +38,7 @@ def test_labels_of_strangers_stay_text(tmp_path: Path) -> None:
         f"A [file](results.csv), a [trap](javascript:alert(1)), [another](https://example.com), `{HOSTILE}`."
     )
     page.table(Table("table", (HOSTILE, "number"), ((HOSTILE, 0.5), (None, 12_345.0))))
-    page.figure("figure", HOSTILE, None)
+    page.figure("figure", HOSTILE, lambda file: None)
     assert page.blocks[-1] == f"![{HOSTILE}](figure.png)"
     made = page_html(page)
     assert made.count("<img ") == 1

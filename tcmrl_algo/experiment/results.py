@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from tcmrl_algo.algorithms.core.settings import TrainingConfig
 from tcmrl_algo.experiment.spec import Experiment, run_id
@@ -40,10 +40,12 @@ COLUMNS = (
 )
 AGAIN = "; delete it, and the run is done again"
 """What helps against a broken result."""
+GONE = frozenset({"shared", "training_of"})
+"""What records of earlier versions say of trainings that runs shared."""
 DIVERGED = "diverged"
 """Instead of a digest, where training diverged; the run's `error.txt` says how."""
 DIGITS = 6
-"""Significant digits of a float in a table or a compact result; reports print four."""
+"""Significant digits of a float in a table of results; reports print four."""
 YES = "yes"
 Row = TypeVar("Row")
 
@@ -125,21 +127,6 @@ class Curve(Frozen):
     points: tuple[CurvePoint, ...] = ()
 
 
-class SharedTraining(Frozen):
-    """What a run takes over from a finished one of equal training.
-
-    Attributes:
-        training_of: `experiment, method` of that run.
-        training_seconds, peak_memory: what it took.
-        evaluations: its documents under protocols with equal settings.
-    """
-
-    training_of: str
-    training_seconds: float | None
-    peak_memory: int | None
-    evaluations: dict[str, dict[str, Any]] = Field(default={})
-
-
 class RunSpec(Frozen):
     """Which run: a method on a dataset with a seed, and all settings.
 
@@ -164,6 +151,13 @@ class RunSpec(Frozen):
     config: TrainingConfig
     tuned: Tuned | None = None
 
+    @model_validator(mode="before")
+    @classmethod
+    def _without_gone(cls, document: Any) -> Any:
+        if not isinstance(document, dict):
+            return document
+        return {key: value for key, value in document.items() if key not in GONE}
+
     @property
     def id(self) -> str:
         """Names the run's files in a results folder."""
@@ -181,13 +175,11 @@ class Job(RunSpec):
     Attributes:
         folder: the run's, absolute; the result is written beside it.
         protocols, curve_points: how it is evaluated.
-        shared: what it takes over from an equal training.
     """
 
     folder: str
     protocols: tuple[str, ...]
     curve_points: int
-    shared: SharedTraining | None = None
 
     def points(self) -> list[int]:
         """Steps at which the learning curve is evaluated; the last one is the end of training."""
@@ -206,7 +198,6 @@ class RunResult(RunSpec):
         training_seconds: of training alone, scaled up to all steps where a killed process did some of
             them; None where none was timed.
         peak_memory: bytes, of the process, or of the CUDA device where there is one.
-        training_of: `experiment, method` whose training it shares, if it was not trained for this one.
         contexts: what a report measured of its contexts; None before, and without a checkpoint.
         behavior_seed: root seed of the dataset; None where none is known.
         commit: of this package's code, with `-dirty` where files were changed since; None where the code was
@@ -227,7 +218,6 @@ class RunResult(RunSpec):
     training_seconds: float | None
     evaluation_seconds: float | None
     peak_memory: int | None
-    training_of: str | None = None
     contexts: ContextMeasures | None = None
     behavior_seed: int | None = None
     commit: str | None = None
@@ -248,37 +238,6 @@ class RunResult(RunSpec):
             | {"success": success_rate(evaluation)}
             for protocol, evaluation in self.evaluations.items()
         ]
-
-    def compact(self) -> "RunResult":
-        """The result as it is committed: rounded, without paths and what only continuing needs.
-
-        The dataset is named by its root alone, and lists of single test tasks, such as the returns of
-        adaptation episodes, are dropped. Reports are computed from such results, so that they are the same
-        before and after. The compact form of a compact result is itself.
-        """
-        document = self.model_dump(mode="json")
-        evaluations = {
-            protocol: evaluation
-            | {
-                "tasks": [
-                    {key: value for key, value in task.items() if not isinstance(value, list)}
-                    for task in evaluation["tasks"]
-                ]
-            }
-            for protocol, evaluation in document["evaluations"].items()
-        }
-        numbers = rounded({key: value for key, value in document.items() if key != "config"})
-        changes = {"dataset": "", "identity": {}, "evaluations": rounded(evaluations), "folder": self.folder}
-        return RunResult.model_validate(numbers | changes | {"config": document["config"]})
-
-
-def rounded(value: Any) -> Any:
-    """A JSON value with every float in it rounded to DIGITS significant digits."""
-    if isinstance(value, float):
-        return float(f"{value:.{DIGITS}g}")
-    if isinstance(value, dict):
-        return {key: rounded(item) for key, item in value.items()}
-    return [rounded(item) for item in value] if isinstance(value, list) else value
 
 
 def success_rate(evaluation: Mapping[str, Any]) -> float | None:

@@ -69,7 +69,6 @@ def run_experiment(
     device: str = "cpu",
     engine: str | BaseEngine = "local",
     tuned: TunedSettings | None = None,
-    reuse: Sequence[str | Path] = (),
     report: Report | None = None,
 ) -> ExperimentReport:
     """Runs an experiment, without the runs that are finished; checks all of it before the first run starts.
@@ -88,8 +87,6 @@ def run_experiment(
         device: a torch device, for runs that are not begun yet.
         engine: what runs them, by name or made before; `workers` says how the cores are shared either way.
         tuned: settings by environment and algorithm, as `tuned_settings` reads them.
-        reuse: other results folders, whose finished trainings are taken over where they are the same, so
-            that only what was not evaluated there is done.
 
     Raises:
         TcmrlError: the plan does not hold, or the folder has runs of other settings or data.
@@ -119,7 +116,6 @@ def run_experiment(
         results = tuple(read_result(out / "runs" / name) for name in names)
         return ExperimentReport(out, results, len(results), (), {}, time.perf_counter() - began)
 
-    from tcmrl_algo.experiment.job import finished_trainings, take_over
     from tcmrl_algo.experiment.plan import plan_runs
     from tcmrl_algo.training.train import usable_device
 
@@ -141,13 +137,11 @@ def run_experiment(
     plan = _chosen(every, experiment, only)
     found = {job.id: before.get(job.id) for job in plan}
     jobs = {job.id: _begun(job) for job in plan if found[job.id] is None}
-    trained = finished_trainings(reuse)
     make_folders(out)
     failed: list[str] = []
     diverged: dict[str, str] = {}
     with lock_file(out / ".lock", f"experiment {out}"):
         write_record(out / "experiment.json", experiment)
-        jobs = {name: take_over(job, trained) for name, job in jobs.items()}
         for job in jobs.values():
             write_record(Path(job.folder) / "job.json", job)
             error_file(Path(job.folder)).unlink(missing_ok=True)
@@ -238,7 +232,7 @@ def _finished(plan: Sequence[Job], out: Path, experiment: Experiment) -> dict[st
 
 
 def _begun(job: Job) -> Job:
-    """The job; one that has begun training keeps its threads, its device and what it took over."""
+    """The job; one that has begun training keeps its threads and its device."""
     from tcmrl_algo.experiment.plan import check_same, with_threads
 
     folder = Path(job.folder)
@@ -247,7 +241,7 @@ def _begun(job: Job) -> Job:
     before = read_record(Job, folder / "job.json")
     check_same(before.identity, job.identity, place=folder)
     config = with_threads(job.config, before.config.settings.run.threads)
-    return job.model_copy(update={"config": config, "device": before.device, "shared": before.shared})
+    return job.model_copy(update={"config": config, "device": before.device})
 
 
 def _run(jobs: dict[str, Job], engine: BaseEngine) -> Iterator[tuple[str, str | None, bool]]:

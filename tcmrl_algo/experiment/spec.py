@@ -205,13 +205,6 @@ class Experiment(Frozen):
         }
         return self.model_copy(update=changes)
 
-    def without_places(self) -> "Experiment":
-        """The same experiment without the folders of its datasets, which results name by their roots."""
-        environments = {
-            name: choice.model_copy(update={"dataset": None}) for name, choice in self.environments.items()
-        }
-        return self.model_copy(update={"environments": environments})
-
     def to_json(self) -> dict[str, Any]:
         """What `read_experiment` takes back."""
         return self.model_dump(mode="json", by_alias=True)

@@ -21,7 +21,7 @@ from tcmrl_algo.experiment.results import (
 from tcmrl_algo.experiment.tunings import TrialRow, read_tuning, trial_rows
 from tcmrl_algo.report.sources import DatasetReturns, Source
 from tcmrl_algo.training.config import stage_plan
-from tcmrl_data import CheckpointError, Worth
+from tcmrl_data import Worth
 from tcmrl_data.foundation.records import digest, read_record
 
 RUNS, CURVES, WORTH = "runs.csv", "curves.csv", "worth.csv"
@@ -186,16 +186,12 @@ def add_rows(file: Path, sources: Iterable[Source]) -> list[RunRow]:
         The rows of these runs.
 
     Raises:
-        CheckpointError: single runs, which have no experiment, or the table is not one.
+        CheckpointError: `file` is no such table.
     """
     rows: list[RunRow] = []
     curves: list[CurveRow] = []
     for source in sources:
         folder = (source.runs[0].folder or Path()).parents[1]
-        if not (folder / "experiment.json").is_file():
-            raise CheckpointError(
-                "single runs have no experiment; only results folders can be added to a table"
-            )
         for result in source.runs:
             rows += run_rows(folder.resolve().name, result, source.datasets.get(result.environment))
             curves += curve_rows(folder.resolve().name, result, source.experiment.protocols[0])
@@ -229,7 +225,6 @@ def add_worth(file: Path, documents: Sequence[Path]) -> list[WorthRow]:
 
 def run_rows(experiment: str, result: RunResult, stored: DatasetReturns | None) -> list[RunRow]:
     """Rows of a run, one per protocol."""
-    result = result.compact()
     known = stored if stored is not None and stored.root == result.root else None
     settings, tuned = result.config.settings, result.tuned
     contexts = result.contexts or ContextMeasures(tasks=0)

@@ -1,33 +1,23 @@
-"""Inputs of a report: results folders and single runs, and what checkpoints and datasets tell of them."""
+"""Inputs of a report: results folders, and what checkpoints and datasets tell of them."""
 
 import itertools
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tcmrl_algo.evaluation.evaluate import evaluate_run
-from tcmrl_algo.evaluation.protocols.base import PROTOCOLS
-from tcmrl_algo.experiment.results import (
-    AGAIN,
-    RunResult,
-    error_file,
-    read_results,
-    result_file,
-    rounded,
-)
-from tcmrl_algo.experiment.spec import Experiment, experiment_of, folder_name, read_experiment, run_id
+from tcmrl_algo.experiment.results import RunResult, error_file, read_results, result_file
+from tcmrl_algo.experiment.spec import Experiment, experiment_of, folder_name, run_id
 from tcmrl_algo.report.contexts import FloatArray, IntArray, Trained, TransitionWeights
-from tcmrl_algo.training.checkpoint import Run, open_run, tensors_digest
-from tcmrl_data import CheckpointError, Dataset, TcmrlError, canonical_json, list_returns, open_dataset
-from tcmrl_data.foundation.records import Frozen, read_record
+from tcmrl_data import CheckpointError, Dataset, TcmrlError, list_returns, open_dataset
 
 
-class SnapshotReturns(Frozen):
+@dataclass(frozen=True)
+class SnapshotReturns:
     """Mean returns of the stored episodes of one snapshot, over tasks.
 
     Attributes:
@@ -40,8 +30,9 @@ class SnapshotReturns(Frozen):
     test: float | None
 
 
-class DatasetReturns(Frozen):
-    """`datasets/ENVIRONMENT.json` of a report: what was stored in the dataset of an environment.
+@dataclass(frozen=True)
+class DatasetReturns:
+    """What is stored in the dataset of an environment.
 
     Attributes:
         snapshots: by ascending step, and last all together.
@@ -85,8 +76,7 @@ def _mean(tasks: Sequence[dict[str, Any]], split: str, step: int | None) -> floa
         for found in task["snapshots"]
         if step in (None, found["step"])
     ]
-    mean: float | None = rounded(float(np.mean(means))) if means else None
-    return mean
+    return float(np.mean(means)) if means else None
 
 
 @dataclass(frozen=True)
@@ -124,11 +114,6 @@ class Source:
     unmeasured: Mapping[str, str] = field(default_factory=dict)
 
     @property
-    def failed(self) -> dict[str, str]:
-        """Errors of the runs that failed, by id."""
-        return {name: error for name, error in self.unfinished.items() if error is not None}
-
-    @property
     def missing(self) -> list[str]:
         """The unfinished runs as text: those that failed with their errors, the others counted.
 
@@ -137,7 +122,7 @@ class Source:
         reached = {folder_name(environment) for environment in self.environments()}
         silent = [name.split("--") for name, error in self.unfinished.items() if error is None]
         numbers = Counter("--".join(parts[: 2 if parts[0] in reached else 1]) for parts in silent)
-        failed = [f"`{name}` ({error})" for name, error in self.failed.items()]
+        failed = [f"`{name}` ({error})" for name, error in self.unfinished.items() if error is not None]
         return [*failed, *(f"{number} of `{place}`" for place, number in numbers.items())]
 
     def environments(self) -> list[str]:
@@ -149,44 +134,33 @@ class Source:
         return [run for run in self.runs if run.environment == environment]
 
     def stored_return(self, environment: str) -> float | None:
-        """Mean return of the stored episodes of the test tasks; None where no report measured it."""
+        """Mean return of the stored episodes of the test tasks; None where the dataset is gone."""
         kept = self.datasets.get(environment)
         return None if kept is None else kept.test_return
 
 
-def read_sources(
-    paths: Sequence[Path],
-    report: Callable[[str, int, int], None] | None = None,
-    *,
-    datasets: Sequence[Path] = (),
-) -> list[Source]:
-    """Reads results folders in the given order; then all run folders as one source, evaluating the runs.
+def read_sources(paths: Sequence[Path], *, datasets: Sequence[Path] = ()) -> list[Source]:
+    """Reads results folders in the given order.
 
     Args:
         paths: the folders; of a folder of results folders, all in it by name.
-        report: called when run folders are evaluated.
         datasets: folders of datasets that were moved after the training of the runs.
 
     Raises:
-        CheckpointError: not a results or run folder, no finished run in it, or a dataset of no run.
+        CheckpointError: not a results folder, no finished run in it, or a dataset of no run.
     """
     places = {open_dataset(folder).manifest.root: str(folder.resolve()) for folder in datasets}
-    sources, runs = [], []
+    sources = []
     for path in paths:
         inner = sorted(path.glob("*/experiment.json"), key=lambda file: natural_order(file.parent.name))
         if (path / "experiment.json").is_file():
             sources.append(_results_folder(path, places))
-        elif (path / "run.json").is_file():
-            runs.append(open_run(path))
         elif inner:
             sources += [_results_folder(file.parent, places) for file in inner]
         else:
             raise CheckpointError(
-                f"{path} contains neither experiment.json nor run.json; name a folder of "
-                "`tcmrl experiment` or `tcmrl train`"
+                f"{path} contains no experiment.json; name a results folder of `tcmrl experiment`"
             )
-    if runs:
-        sources.append(_single_runs(runs, report, places))
     used = {run.root for source in sources for run in source.runs}
     for root, place in places.items():
         if root not in used:
@@ -213,11 +187,7 @@ def _results_folder(path: Path, places: Mapping[str, str]) -> Source:
     found = [_relocated(result, places) for result in read_results(path, experiment)]
     if not found:
         raise CheckpointError(f"{path} contains no finished run; continue with `tcmrl experiment`")
-    records = [
-        read_record(DatasetReturns, file, remedy=AGAIN) for file in sorted(path.glob("datasets/*.json"))
-    ]
-    datasets = {record.environment: record for record in records}
-    return Source(experiment, tuple(found), _unfinished(path, experiment), datasets)
+    return Source(experiment, tuple(found), _unfinished(path, experiment))
 
 
 def _unfinished(path: Path, experiment: Experiment) -> dict[str, str | None]:
@@ -234,119 +204,27 @@ def _unfinished(path: Path, experiment: Experiment) -> dict[str, str | None]:
     return found
 
 
-def _single_runs(
-    runs: Sequence[Run], report: Callable[[str, int, int], None] | None, places: Mapping[str, str]
-) -> Source:
-    """Single runs as an experiment; runs of one algorithm are the seeds of one method."""
-    labels = labels_of(runs)
-    experiment = read_experiment(
-        {
-            "schema": 1,
-            "name": "runs",
-            "title": "Single runs",
-            "source": "none",
-            "seeds": sorted({run.record.seed for run in runs}),
-            "environments": {run.record.environment: {} for run in runs},
-            "methods": {
-                label: {"algorithm": run.record.config.settings.run.algorithm}
-                for label, run in zip(labels, runs, strict=True)
-            },
-        },
-        place="the run folders",
-    )
-    found = []
-    for done, (label, run) in enumerate(zip(labels, runs, strict=True), start=1):
-        found.append(_evaluated(label, run, places.get(run.record.root)))
-        if report is not None:
-            report("evaluating", done, len(runs))
-    order = list(experiment.methods)
-
-    def place_of(run: RunResult) -> tuple[str, int, int]:
-        return run.environment, order.index(run.method), run.seed
-
-    return Source(experiment, tuple(sorted(found, key=place_of)))
-
-
-def labels_of(runs: Sequence[Run]) -> list[str]:
-    """Labels of runs: the algorithm, and the folder's name if its runs differ by more than the seed."""
-    groups: dict[tuple[str, str], list[Run]] = {}
-    names = [run.record.config.settings.run.algorithm for run in runs]
-    for name, run in zip(names, runs, strict=True):
-        groups.setdefault((name, run.record.environment), []).append(run)
-    mixed = {name for (name, _), group in groups.items() if not _are_seeds(group)}
-    return [
-        f"{name} {run.folder.name}" if name in mixed else name for name, run in zip(names, runs, strict=True)
-    ]
-
-
-def _are_seeds(runs: Sequence[Run]) -> bool:
-    """Whether the runs differ only by their seeds."""
-    kinds = {
-        (canonical_json(run.record.config.model_dump(mode="json")), run.record.root, run.newest().step)
-        for run in runs
-    }
-    return len(kinds) == 1 and len({run.record.seed for run in runs}) == len(runs)
-
-
-def _evaluated(label: str, run: Run, place: str | None) -> RunResult:
-    record = run.record
-    documents = {
-        name: evaluate_run(run.folder, protocol=name, dataset_path=place).to_json()
-        for name in PROTOCOLS.working()
-    }
-    return RunResult(
-        folder=run.folder,
-        experiment="runs",
-        method=label,
-        algorithm=record.config.settings.run.algorithm,
-        privileged=record.privileged,
-        environment=record.environment,
-        seed=record.seed,
-        profile=record.profile,
-        dataset=place or record.dataset,
-        root=record.root,
-        steps=run.newest().step,
-        device=record.device,
-        threads=record.config.settings.run.threads,
-        identity={},
-        config=record.config,
-        versions=record.versions,
-        digest=tensors_digest(run.newest().tensors()),
-        curve=(),
-        evaluations=documents,
-        training_seconds=None,
-        evaluation_seconds=None,
-        peak_memory=None,
-    )
-
-
 def measured(source: Source) -> Source:
-    """The source with compact results that hold what checkpoints and datasets tell, or an earlier report."""
+    """The source with what checkpoints and datasets tell of its runs, as far as they are there."""
     trained = Trained()
-    results: dict[str, list[RunResult]] = {}
-    datasets, contexts, unmeasured = dict(source.datasets), {}, {}
+    results: list[RunResult] = []
+    datasets: dict[str, DatasetReturns] = {}
+    contexts: dict[str, Contexts] = {}
+    unmeasured: dict[str, str] = {}
     for environment in source.environments():
         runs = source.results(environment)
         try:
-            results[environment] = [_measured(run, trained) for run in runs]
+            results += [_measured(run, trained) for run in runs]
             contexts[environment] = _contexts(runs, trained)
             datasets[environment] = dataset_returns(trained.stored(runs[0]).dataset)
         except TcmrlError as error:
-            results[environment] = runs
-            if not _has_measures(environment, runs, datasets):
-                unmeasured[environment] = str(error)
-    kept = tuple(result.compact() for found in results.values() for result in found)
-    return replace(source, runs=kept, datasets=datasets, contexts=contexts, unmeasured=unmeasured)
+            results += runs
+            unmeasured[environment] = str(error)
+    return replace(source, runs=tuple(results), datasets=datasets, contexts=contexts, unmeasured=unmeasured)
 
 
 def _measured(run: RunResult, trained: Trained) -> RunResult:
     return run.model_copy(update={"contexts": trained.contexts(run).measures()})
-
-
-def _has_measures(
-    environment: str, runs: Sequence[RunResult], datasets: Mapping[str, DatasetReturns]
-) -> bool:
-    return environment in datasets and all(run.contexts is not None for run in runs)
 
 
 def _contexts(runs: Sequence[RunResult], trained: Trained) -> Contexts:

@@ -1,7 +1,5 @@
 """Tables of a report, as Markdown and as CSV, one function each; `write.py` orders them."""
 
-import importlib.resources
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,10 +9,6 @@ from tcmrl_algo.report.sources import DatasetReturns
 from tcmrl_algo.report.statistics import Verdict, by_method, coverage, known_scores, summarize
 
 Cell = str | float | int | None
-PAPER_COSTS = ("paper: training s", "paper: MB")
-PAPER_ATTENTION = ("paper: mean", "paper: median")
-IDAQ = ("IDAQ", "idaq_literal")
-"""IDAQ trains as FOCAL does, and adapts by this protocol."""
 PARTS = ("final", "shuffled", "regret", "normalized", "fixed")
 
 
@@ -151,42 +145,19 @@ def registered_table(name: str, judged: Mapping[str, Sequence[Verdict]]) -> Tabl
     return Table(name, columns, tuple(rows))
 
 
-def published_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
-    """Scores of the paper's Table 2 and our returns, matched by the name of the method.
-
-    None if the units differ, or if the paper has none of our methods.
-    """
-    scores, ours = published()["returns"].get(environment, {}), by_method(results)
-    if not scores.keys() & ours.keys():
-        return None
-    protocols = list(results[0].evaluations)
-    rows: list[tuple[Cell, ...]] = []
-    for method in dict.fromkeys((*scores, *ours)):
-        cells: list[Cell] = []
-        for protocol in protocols:
-            trained = "FOCAL" if (method, protocol) == IDAQ and method not in ours else method
-            finals = [run.evaluations[protocol]["mean_final"] for run in ours.get(trained, [])]
-            cells += across_seeds(finals)[::2]
-        rows.append((method, _plus_minus(scores.get(method)), *cells))
-    columns = [f"ours, {protocol}{part}" for protocol in protocols for part in ("", ": 95% interval")]
-    return Table(name, ("method", "paper, Table 2", *columns), tuple(rows))
-
-
-def cost_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
-    """Time and memory per method, with those of the paper's Tables 6 and 7; None if no run was timed."""
+def cost_table(name: str, results: Sequence[RunResult]) -> Table | None:
+    """Time and memory per method; None if no run was timed."""
     if all(result.training_seconds is None for result in results):
         return None
-    costs = published()["costs"].get(environment, {})
     rows: list[tuple[Cell, ...]] = []
     for method, runs in by_method(results).items():
         training, _, interval = across_seeds([run.training_seconds for run in runs])
         evaluation = across_seeds([run.evaluation_seconds for run in runs])[0]
         memory = across_seeds([None if run.peak_memory is None else run.peak_memory / 1e6 for run in runs])[0]
         pace = training / runs[0].steps * 1e3 if isinstance(training, float) else None
-        printed = costs.get(method, (None, None)) if costs else ()
-        rows.append((method, training, interval, pace, evaluation, memory, *printed))
+        rows.append((method, training, interval, pace, evaluation, memory))
     columns = ("method", "training s", "95% interval", "ms per step", "evaluation s", "peak MB")
-    return Table(name, (*columns, *(PAPER_COSTS if costs else ())), tuple(rows))
+    return Table(name, columns, tuple(rows))
 
 
 def context_table(name: str, results: Sequence[RunResult]) -> Table:
@@ -205,12 +176,11 @@ def context_table(name: str, results: Sequence[RunResult]) -> Table:
     return Table(name, ("method", "runs", *columns), tuple(rows))
 
 
-def attention_table(name: str, environment: str, results: Sequence[RunResult]) -> Table | None:
-    """Relative weights of transitions with and without reward, with those of the paper's Table 5.
+def attention_table(name: str, results: Sequence[RunResult]) -> Table | None:
+    """Relative weights of transitions with and without reward.
 
     None if no trajectory contains both kinds, or no method has attention.
     """
-    printed = published()["attention"].get(environment, {})
     rows: list[tuple[Cell, ...]] = []
     for kind in ("nonzero", "zero"):
         for method, runs in by_method(results).items():
@@ -218,9 +188,9 @@ def attention_table(name: str, environment: str, results: Sequence[RunResult]) -
             mean, _, interval = across_seeds([getattr(found, f"attention_{kind}") for found in measured])
             median = across_seeds([getattr(found, f"median_{kind}") for found in measured])[0]
             if mean is not None:
-                rows.append((method, f"{kind} reward", mean, interval, median, *printed.get(kind, ())))
+                rows.append((method, f"{kind} reward", mean, interval, median))
     columns = ("method", "transitions", "mean", "95% interval", "median")
-    return Table(name, (*columns, *(PAPER_ATTENTION if printed else ())), tuple(rows)) if rows else None
+    return Table(name, columns, tuple(rows)) if rows else None
 
 
 def dataset_table(name: str, returns: DatasetReturns) -> Table:
@@ -265,13 +235,3 @@ def digest_table(name: str, results: Sequence[RunResult]) -> Table:
     """Digests of the runs' tensors, for comparison with a repetition."""
     rows = tuple((result.label, result.seed, result.fold, result.digest) for result in results)
     return Table(name, ("method", "seed", "fold", "sha256 of all tensors"), rows)
-
-
-def published() -> dict[str, Any]:
-    """Numbers of the paper that reports print beside ours."""
-    file = importlib.resources.files("tcmrl_manifests") / "published.toml"
-    return tomllib.loads(file.read_text(encoding="utf-8"))
-
-
-def _plus_minus(score: Sequence[float] | None) -> str | None:
-    return None if score is None else " ± ".join(f"{number:g}" for number in score)

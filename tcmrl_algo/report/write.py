@@ -1,7 +1,4 @@
-"""Writes a report: Markdown, HTML, CSV and PNG, and the compact results from which it can be made again.
-
-The verdicts on registered claims come first. All is computed from compact results alone.
-"""
+"""Writes a report: Markdown, HTML, CSV and PNG. The verdicts on registered claims come first."""
 
 import base64
 import html
@@ -16,7 +13,7 @@ from markdown_it import MarkdownIt
 from markdown_it.token import Token
 from markupsafe import Markup
 
-from tcmrl_algo.experiment.results import RunResult, error_file, result_file
+from tcmrl_algo.experiment.results import RunResult
 from tcmrl_algo.experiment.spec import folder_name
 from tcmrl_algo.report import figures, tables
 from tcmrl_algo.report.contexts import embed
@@ -26,7 +23,6 @@ from tcmrl_algo.report.statistics import SCORES, Verdict, judge, known_scores
 from tcmrl_algo.report.tables import Table
 from tcmrl_data.foundation.disk import make_folders, replace_file
 from tcmrl_data.foundation.page import allowed_text, render_page
-from tcmrl_data.foundation.records import write_record
 
 ReportProgress = Callable[[str, int, int], None]
 """Receives the name of a stage, the amount done and the total amount."""
@@ -56,23 +52,19 @@ ADAPTATION = """\
 Returns of the adaptation episodes of a protocol in turn, means over test tasks and runs. The first episodes \
 of `paper` act uniformly, those of the other protocols by stored or tried contexts; where the first stage is \
 random, the protocol was run several times (`repeats` in the JSON documents), and all returns are means."""
-BESIDE = """\
-The paper has other data, another split of tasks, other training and its own protocol: the columns have \
-the same unit, but are not comparable otherwise."""
 TUNING = """\
 Settings by which all methods of an algorithm were trained, where a method does not set another value; the \
 score is the mean normalized return on held-out training tasks. Test tasks had no part in it."""
 COSTS = """\
 Training time excludes evaluation; evaluation time covers all points of the learning curve and all \
 protocols. Memory is that of the process or, on CUDA, of the tensors on the device. Runs that shared a \
-machine are slower. The paper's numbers, if printed, are for 40,000 steps on one RTX 2080 Ti."""
+machine are slower."""
 CONTEXTS = """\
 Every point is the t-SNE of the context of one stored trajectory, for the first seed of every method; \
 triangles are test tasks. The table contains the mean distance between contexts of one task over that \
 between contexts of two tasks, in the latent space."""
 ATTENTION = """\
-Only trajectories with both kinds of transitions count. The paper's weights are not relative: compare the \
-ratios of the rows."""
+Only trajectories with both kinds of transitions count."""
 
 
 @dataclass(frozen=True)
@@ -90,17 +82,17 @@ class Page:
     """The text of a report, its tables, and its figures.
 
     Attributes:
-        out: folder of the report; a figure that needs checkpoints is kept if it is there.
+        out: folder of the report.
         blocks: Markdown paragraphs, headings, tables and figures in their order.
         tables: by file name; one CSV file each.
-        figures: file names, with what draws them; None if an earlier report drew them.
+        figures: file names, with what draws them.
         roots: of datasets whose returns are on the page.
     """
 
     out: Path
     blocks: list[str] = field(default_factory=list)
     tables: list[Table] = field(default_factory=list)
-    figures: dict[str, Draw | None] = field(default_factory=dict)
+    figures: dict[str, Draw] = field(default_factory=dict)
     roots: set[str] = field(default_factory=set)
 
     def text(self, line: str) -> None:
@@ -116,12 +108,10 @@ class Page:
         """Adds only the CSV file of a table."""
         self.tables.append(table)
 
-    def figure(self, name: str, caption: str, draw: Draw | None) -> None:
-        """Adds a figure; without `draw`, the one of an earlier report, if there is one."""
-        file = f"{name}.png"
-        if draw is not None or (self.out / file).is_file():
-            self.blocks.append(f"![{caption}]({file})")
-            self.figures[file] = draw
+    def figure(self, name: str, caption: str, draw: Draw) -> None:
+        """Adds a figure."""
+        self.blocks.append(f"![{caption}]({name}.png)")
+        self.figures[f"{name}.png"] = draw
 
     def markdown(self) -> str:
         """The content of `report.md`."""
@@ -136,20 +126,17 @@ def write_report(
     rows: str | Path | None = None,
     report: ReportProgress | None = None,
 ) -> WrittenReport:
-    """Writes a report on results folders of experiments, on run folders, and on earlier reports.
-
-    Beside the report stand the compact results of all runs, so that the report is itself a results folder
-    from which the same report can be written, without checkpoints and datasets.
+    """Writes a report on results folders of experiments.
 
     Args:
-        paths: the folders; all run folders are in one section.
+        paths: the folders; of a folder of results folders, all in it.
         out: folder of the report, created if needed; files of an earlier report are replaced.
         datasets: folders of datasets that were moved after the training of the runs.
         rows: a table, `runs.csv`, to which the runs of results folders are added.
 
     Raises:
-        CheckpointError: not a results or run folder, no finished run in it, a dataset of no run, or `rows`
-            is no table.
+        CheckpointError: not a results folder, no finished run in it, a dataset of no run, or `rows` is no
+            table.
 
     Example:
         >>> write_report(["results/perspectives"], "reports/perspectives").verdicts  # doctest: +SKIP
@@ -160,14 +147,8 @@ def write_report(
         add_rows(Path(rows), [source for _, source in sources])
     page, judged = compose(sources, out)
     make_folders(out)
-    records = [
-        file
-        for name, source in sources
-        for file in _write_records(out if len(sources) == 1 else out / name, source)
-    ]
     for done, (file, draw) in enumerate(page.figures.items(), start=1):
-        if draw is not None:
-            draw(out / file)
+        draw(out / file)
         if report is not None:
             report("drawing figures", done, len(page.figures))
     for table in page.tables:
@@ -176,7 +157,7 @@ def write_report(
     replace_file(out / "report.html", page_html(page).encode())
     names = ["report.md", "report.html", *(f"{table.name}.csv" for table in page.tables), *page.figures]
     verdicts = tuple(itertools.chain.from_iterable(judged.values()))
-    return WrittenReport(out / "report.md", (*(out / name for name in names), *records), verdicts)
+    return WrittenReport(out / "report.md", tuple(out / name for name in names), verdicts)
 
 
 def measure_paths(
@@ -185,10 +166,8 @@ def measure_paths(
     datasets: Sequence[str | Path] = (),
     report: ReportProgress | None = None,
 ) -> list[tuple[str, Source]]:
-    """The experiments in folders with compact results, by unique names, in natural order."""
-    sources = read_sources(
-        [Path(path) for path in paths], report, datasets=[Path(folder) for folder in datasets]
-    )
+    """The experiments in folders, with what their checkpoints tell, by unique names in natural order."""
+    sources = read_sources([Path(path) for path in paths], datasets=[Path(folder) for folder in datasets])
     sources.sort(key=lambda source: natural_order(source.experiment.name))
     found: list[tuple[str, Source]] = []
     for number, source in enumerate(sources):
@@ -257,12 +236,7 @@ def _add_environment(page: Page, name: str, environment: str, source: Source) ->
             lambda file: figures.draw_adaptation(file, environment, results),
         )
         page.data(adaptation)
-    published = tables.published_table(f"{name}-paper", environment, results)
-    if published is not None:
-        page.text("#### Numbers of the paper")
-        page.text(BESIDE)
-        page.table(published)
-    costs = tables.cost_table(f"{name}-costs", environment, results)
+    costs = tables.cost_table(f"{name}-costs", results)
     if costs is not None:
         page.text("#### Time and memory")
         page.text(COSTS)
@@ -276,7 +250,7 @@ def _add_environment(page: Page, name: str, environment: str, source: Source) ->
         reason = source.unmeasured[environment]
         page.text(f"Contexts, attention and the dataset's returns are omitted: {reason}.")
     else:
-        _add_contexts(page, name, environment, results, source.contexts.get(environment))
+        _add_contexts(page, name, environment, results, source.contexts[environment])
         _add_dataset(page, name, environment, source)
     page.data(tables.digest_table(f"{name}-digests", results))
     page.text(f"[Digests of the runs' tensors]({name}-digests.csv).")
@@ -294,19 +268,16 @@ def _add_curves(page: Page, name: str, environment: str, results: Sequence[RunRe
 
 
 def _add_contexts(
-    page: Page, name: str, environment: str, results: Sequence[RunResult], contexts: Contexts | None
+    page: Page, name: str, environment: str, results: Sequence[RunResult], contexts: Contexts
 ) -> None:
     tasks = max(result.contexts.tasks for result in results if result.contexts is not None)
     page.text("#### Contexts")
     page.text(f"{tasks} tasks. {CONTEXTS}")
-    if contexts is None or contexts.points:
-        page.figure(f"{name}-tsne", "t-SNE of contexts", None if contexts is None else _embedding(contexts))
+    if contexts.points:
+        page.figure(f"{name}-tsne", "t-SNE of contexts", _embedding(contexts))
     page.table(tables.context_table(f"{name}-contexts", results))
-    if contexts is not None and contexts.weights:
-        weights = contexts.weights
-        _add_attention(page, name, environment, results, lambda file: figures.draw_attention(file, weights))
-    elif contexts is None and (page.out / f"{name}-attention.png").is_file():
-        _add_attention(page, name, environment, results, None)
+    if contexts.weights:
+        _add_attention(page, name, environment, results, contexts)
 
 
 def _embedding(contexts: Contexts) -> Draw:
@@ -318,12 +289,16 @@ def _embedding(contexts: Contexts) -> Draw:
 
 
 def _add_attention(
-    page: Page, name: str, environment: str, results: Sequence[RunResult], draw: Draw | None
+    page: Page, name: str, environment: str, results: Sequence[RunResult], contexts: Contexts
 ) -> None:
     page.text("#### Attention")
     page.text("Weight of a transition in its trajectory's context, times the steps; uniform attention is 1.")
-    page.figure(f"{name}-attention", "attention along trajectories", draw)
-    table = tables.attention_table(f"{name}-attention", environment, results)
+    page.figure(
+        f"{name}-attention",
+        "attention along trajectories",
+        lambda file: figures.draw_attention(file, contexts.weights),
+    )
+    table = tables.attention_table(f"{name}-attention", results)
     if table is None:
         page.text("No stored trajectory contains transitions both with and without reward.")
     else:
@@ -384,23 +359,3 @@ def _table_open(renderer: Any, tokens: Sequence[Token], *_: Any) -> str:
 
 def _table_close(renderer: Any, tokens: Sequence[Token], *_: Any) -> str:
     return "</table></div>"
-
-
-def _write_records(folder: Path, source: Source) -> list[Path]:
-    """Writes a results folder with compact results; the files."""
-    make_folders(folder)
-    files = [folder / "experiment.json"]
-    write_record(files[0], source.experiment.without_places())
-    for result in source.runs:
-        files.append(result_file(folder / "runs" / result.id))
-        make_folders(files[-1].parent)
-        replace_file(files[-1], f"{result.model_dump_json()}\n".encode())  # in the order of its protocols
-    for environment, returns in source.datasets.items():
-        files.append(folder / "datasets" / f"{folder_name(environment)}.json")
-        make_folders(files[-1].parent)
-        write_record(files[-1], returns)
-    for name, error in source.failed.items():
-        files.append(error_file(folder / "runs" / name))
-        make_folders(files[-1].parent)
-        replace_file(files[-1], f"{error}\n".encode())
-    return files

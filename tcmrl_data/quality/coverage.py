@@ -123,7 +123,7 @@ def measure_coverage(
         0.3
     """
     if not 0 < cell < np.inf:
-        raise SelectionError(f"--cell {cell} is not a positive number of standard deviations")
+        raise SelectionError(f"cell {cell} is not a positive number of standard deviations")
     grid = _grid(measured.sampled_parts(dataset), cell)
     tasks = list(dict.fromkeys(key.task for key in measured.filled_parts(dataset)))
     compared = evenly_spread(tasks, overlap_tasks)

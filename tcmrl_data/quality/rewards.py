@@ -85,7 +85,7 @@ def measure_rewards(
         StoreError: a part is damaged.
     """
     if bins < 1:
-        raise SelectionError(f"--bins {bins} is not a positive number")
+        raise SelectionError(f"bins {bins} is not a positive number")
     edges = _edges([steps.rewards for steps in measured.sampled_parts(dataset)], bins)
     counts, rows = dict[tuple[int, Split], Counts](), []
     for task, parts in measured.steps_by_task(dataset, progress):

@@ -133,7 +133,7 @@ def measure_worth(
         0.02
     """
     if transitions < NEIGHBOURS:
-        raise SelectionError(f"--transitions {transitions} is less than the {NEIGHBOURS} neighbours")
+        raise SelectionError(f"transitions {transitions} is less than the {NEIGHBOURS} neighbours")
     transfer = measure_transfer(
         dataset,
         tasks=tasks,

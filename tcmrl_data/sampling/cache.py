@@ -10,7 +10,7 @@ One process writes at a time, under the cache's lock; others wait. Before it wri
 entries are removed until all fit below TCMRL_CACHE_LIMIT. A reader holds a shared lock on its entry, so that
 no entry in use is removed.
 
-A file of up to CHECKED_BYTES is hashed whenever it is opened; `tcmrl-data cache verify` hashes all. Nothing
+A file of up to CHECKED_BYTES is hashed whenever it is opened; `verify_cache` hashes all. Nothing
 here guards against a person who may write to the cache's folder: give write access only to those who are
 trusted.
 """

@@ -9,19 +9,6 @@ from tcmrl_data.foundation.records import Frozen
 PROTOCOL_GROUP = "tcmrl.protocols"
 """The entry point group of protocols, which live in a room above this one."""
 
-EVALUATION_KEYS = frozenset(
-    {
-        "protocol",
-        "episodes",
-        "random_episodes",
-        "candidates",
-        "repeats",
-        "offline_trajectories",
-        "final_episodes",
-    }
-)
-"""Settings of `RunSettings` that only evaluation reads."""
-
 LOGGING_KEYS = frozenset({"log_every", "checkpoint_every"})
 """Settings of `RunSettings` that change no tensor."""
 

@@ -1,20 +1,18 @@
-"""Experiments that take over trainings of others, and tuned settings."""
+"""Experiments with tuned settings, and with runs of earlier versions."""
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
 import pytest
 from tcmrl_cli.train import tcmrl
 
-from tcmrl_algo import ExperimentReport, add_tunings, run_experiment, tuned_settings
+from tcmrl_algo import add_tunings, run_experiment, tuned_settings
 from tcmrl_algo.experiment.plan import plan_runs
 from tcmrl_algo.experiment.results import Job
 from tcmrl_algo.experiment.spec import Experiment, read_experiment
 from tcmrl_algo.experiment.tunings import RECORD, Trial, Tuning
 from tcmrl_data import CheckpointError, TrainingError
-from tcmrl_data.engine.local import InProcessEngine
 from tcmrl_data.foundation.records import write_record
 from tests import experiments
 from tests.commands import Call, assert_refused, in_process
@@ -29,96 +27,18 @@ def _experiment(dataset: Path, **changes: Any) -> Experiment:
     return read_experiment(experiments.tables(dataset, **given), place="test")
 
 
-@pytest.fixture(scope="module")
-def source(tiny_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, ExperimentReport]:
-    """An experiment with one finished run."""
-    out = tmp_path_factory.mktemp("source") / "results"
-    return out, run_experiment(_experiment(tiny_folder), out, workers=1, engine=InProcessEngine())
-
-
-def _with_run(dataset: Path, **run: Any) -> Experiment:
-    training = experiments.SMALL | {"run": experiments.SMALL["run"] | run}
-    return _experiment(dataset, training=training, curve_points=1)
-
-
-def test_an_equal_training_is_evaluated_only(
-    source: tuple[Path, ExperimentReport], tiny_folder: Path, tmp_path: Path
-) -> None:
-    folder, made = source
-    (before,) = made.results
-    other = _experiment(
-        tiny_folder,
-        name="other",
-        methods={"full": {"algorithm": "tcmrl", "training": {"run": {"log_every": 20}}}},
-        protocols=["offline", "paper"],
-    )
-    (result,) = run_experiment(other, tmp_path / "other", reuse=[folder]).results
-    assert result.training_of == "small, TCMRL"
-    assert (result.experiment, result.method) == ("other", "full")
-    assert result.digest == before.digest
-    assert result.evaluations["offline"] == before.evaluations["offline"]
-    assert result.training_seconds == before.training_seconds
-    assert [point.final for point in result.curve] == [point.final for point in before.curve]
-    assert sum(point.timed_steps for point in result.curve[-1:]) == 0
-    (trained,) = run_experiment(other, tmp_path / "trained", workers=1).results
-    assert trained.training_of is None
-    assert trained.digest == before.digest
-    assert trained.evaluations == result.evaluations
-
-
-def test_other_evaluation_settings_evaluate_the_same_tensors_anew(
-    source: tuple[Path, ExperimentReport], tiny_folder: Path, tmp_path: Path
-) -> None:
-    folder, made = source
-    other = _with_run(tiny_folder, offline_trajectories=1)
-    (result,) = run_experiment(other, tmp_path, reuse=[folder]).results
-    assert result.digest == made.results[0].digest
-    assert result.config.settings.run.offline_trajectories == 1
-    assert result.evaluations != made.results[0].evaluations
-
-
-@pytest.mark.check
-@pytest.mark.parametrize(
-    "changes",
-    [
-        {"seeds": [1]},
-        {"methods": {"TCMRL": {"algorithm": "tcmrl", "training": {"tcmrl": {"temperature": 2.0}}}}},
-        {"methods": {"FOCAL": {"algorithm": "focal"}}},
-        {"training": experiments.SMALL | {"run": experiments.SMALL["run"] | {"steps": 20}}},
-        {"curve_points": 4},
-        {"protocols": ["idaq"]},
-    ],
-)
-def test_another_training_or_curve_is_done(
-    changes: dict[str, Any], source: tuple[Path, ExperimentReport], tiny_folder: Path, tmp_path: Path
-) -> None:
-    (result,) = run_experiment(_experiment(tiny_folder, **changes), tmp_path, reuse=[source[0]]).results
-    assert result.training_of is None
-    assert all(point.timed_steps > 0 for point in result.curve)
-
-
-def test_a_setting_newer_than_a_training_has_its_default_there(
-    source: tuple[Path, ExperimentReport], tiny_folder: Path, tmp_path: Path
-) -> None:
-    old = tmp_path / "old"
-    shutil.copytree(source[0], old)
-    (file,) = old.glob("runs/*.json")
-    document = json.loads(file.read_text())
+def test_a_run_from_before_a_setting_existed_has_its_default(tiny_folder: Path, tmp_path: Path) -> None:
+    """Its record may say of a shared training too."""
+    (before,) = run_experiment(_experiment(tiny_folder), tmp_path).results
+    (file,) = tmp_path.glob("runs/*.json")
+    document = json.loads(file.read_text()) | {"training_of": "another, TCMRL"}
     del document["identity"]["training"]["actor_critic"]["cloning"]
     file.write_text(json.dumps(document))
-    (again,) = run_experiment(_experiment(tiny_folder), old).results
-    assert again.digest == source[1].results[0].digest
-    (same,) = run_experiment(_experiment(tiny_folder), tmp_path / "same", reuse=[old]).results
-    assert same.training_of is not None
+    again = run_experiment(_experiment(tiny_folder), tmp_path)
+    assert (again.present, again.results[0].digest) == (1, before.digest)
     cloned = experiments.SMALL | {"actor_critic": {"hidden": [8], "cloning": 1.0}}
     with pytest.raises(CheckpointError, match=r"actor_critic\.cloning 0\.0, this experiment has 1\.0"):
-        run_experiment(_experiment(tiny_folder, training=cloned), old)
-
-
-def test_a_folder_without_results_is_refused(tiny_folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(CheckpointError, match="holds no results"):
-        run_experiment(_experiment(tiny_folder), tmp_path / "out", reuse=[tmp_path])
-    assert not (tmp_path / "out" / "runs").exists()
+        run_experiment(_experiment(tiny_folder, training=cloned), tmp_path)
 
 
 def _tune(folder: Path, name: str, *, trials: int = 2, score: float | None = 0.5) -> None:
