@@ -3,6 +3,7 @@
 # make check  what continuous integration runs: linters, types, and all tests but the sweeps
 # make sweeps what takes hours: every kill, every fault, a million parts; before a release
 # make packages   wheel and sdist, each installed afresh with what reading needs, and tried on a dataset
+# make constraints   constraints.txt with the newest versions that pyproject.toml allows, from a fresh environment
 # make docs   the documentation as a site, in build/docs
 # make results   results/README.md from the tables beside it
 PYTHON ?= python3
@@ -12,6 +13,7 @@ DATA ?= data/demo
 RUN ?= runs/demo
 VENV := .venv
 BIN := $(VENV)/bin
+EXTRAS := docs,minari,parquet,ray,remote,report,tensordict,test,tune
 INSTALLED := $(VENV)/.installed
 INSTALLED_TEST := $(VENV)/.installed-test
 INSTALLED_DOCS := $(VENV)/.installed-docs
@@ -25,7 +27,7 @@ export MPLBACKEND ?= Agg
 # Hundreds of processes would compile the packages again.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test check packages sweeps format docs docs-links results clean
+.PHONY: demo test check packages constraints sweeps format docs docs-links results clean
 
 $(BIN)/python:
 	@$(PYTHON) -c "import sys; assert (3, 11) <= sys.version_info[:2] <= (3, 13), 'Python 3.11 to 3.13 needed: make PYTHON=python3.11'"
@@ -37,7 +39,7 @@ $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
 	@touch $@
 
 $(INSTALLED_TEST): $(INSTALLED)
-	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[docs,minari,parquet,ray,remote,report,tensordict,test,tune]'
+	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[$(EXTRAS)]'
 	@touch $@
 
 $(INSTALLED_DOCS): $(INSTALLED)
@@ -72,6 +74,13 @@ packages: $(INSTALLED)
 	$(READER)/tcmrl-data show tests/frozen/dataset
 	$(READER)/pip install --quiet --no-deps --force-reinstall build/packages/*.whl
 	$(READER)/tcmrl-data verify tests/frozen/dataset
+
+constraints:
+	$(PYTHON) -m venv --clear build/constraints
+	build/constraints/bin/pip install --quiet torch==2.13.0
+	build/constraints/bin/pip install --quiet '.[benchmark,$(EXTRAS)]'
+	(head -n 2 constraints.txt; build/constraints/bin/pip freeze --all --exclude pip --exclude tcmrl | sed 's/+cpu$$//') > build/constraints/new
+	mv build/constraints/new constraints.txt
 
 sweeps: $(INSTALLED_TEST)
 	$(BIN)/python -m pytest $(SPREAD) --sweep 1 -m sweep
