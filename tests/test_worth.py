@@ -30,13 +30,19 @@ def walker(x: float) -> Snapshot:
     return Snapshot(5, description, tensors)
 
 
-@pytest.fixture
-def opposite(tmp_path: Path) -> Dataset:
+REFERENCES = References(uniform=-30.0, oracle=-4.5, scripted=None)
+
+
+def walkers(folder: Path, references: References = REFERENCES) -> Dataset:
     """Tasks 0 and 99, whose goals are (1, 0) and (-1, 0), and policies that walk 20 steps right and left."""
     keys = {PartKey(0, 5): walker(1.0), PartKey(99, 5): walker(-1.0)}
     episodes = {key: [episode([0.0, 1.0]), episode([0.0, 1.0])] for key in keys}
-    references = References(uniform=-30.0, oracle=-4.5, scripted=None)
-    return made_dataset(tmp_path / "opposite", episodes, references=references, snapshots=keys)
+    return made_dataset(folder, episodes, references=references, snapshots=keys)
+
+
+@pytest.fixture
+def opposite(tmp_path: Path) -> Dataset:
+    return walkers(tmp_path / "opposite")
 
 
 def test_a_policy_gets_the_same_far_from_its_task_whoever_looks(opposite: Dataset) -> None:
@@ -208,3 +214,13 @@ def test_the_command_prints_what_python_gives(
     printed = call("inspect", what, opposite.folder)[1]
     assert "60.8%" in printed if what == "worth" else "-41.00" in printed
     assert_refused(call("inspect", what, opposite.folder, "--plot", tmp_path / "no.gif"), "no.gif", ".png")
+
+
+def test_a_worth_above_all_is_explained(call: Call, tmp_path: Path) -> None:
+    """15.5 are gained over the best single policy. The best stored return is -2: 18 above -20, 13 above -15."""
+    for uniform, shown in ((-20.0, "86.1%"), (-15.0, "119.2%")):
+        references = References(uniform=uniform, oracle=None, scripted=None)
+        dataset = walkers(tmp_path / shown, references)
+        code, printed, remarks = call("inspect", "worth", dataset.folder)
+        assert code == 0 and shown in printed
+        assert ("A worth above 100%" in remarks) == (uniform == -15.0)
