@@ -4,6 +4,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import tomlkit
+
 from tcmrl_algo import TrainingConfig, resolve, run_experiment, write_report
 from tcmrl_algo.experiment.results import CurvePoint, RunResult
 from tcmrl_algo.experiment.spec import read_experiment, run_id
@@ -154,21 +156,5 @@ def run_small(dataset: Path, out: Path) -> None:
 
 def write_file(file: Path, content: dict[str, Any]) -> Path:
     """The tables as a TOML file."""
-    file.write_text("\n".join(_lines(content, "")), encoding="utf-8")
+    file.write_text(tomlkit.dumps(content), encoding="utf-8")
     return file
-
-
-def _lines(table: dict[str, Any], prefix: str) -> list[str]:
-    import json
-
-    found: list[str] = []
-    for key, value in table.items():
-        name = f"{prefix}{json.dumps(key)}"
-        if isinstance(value, dict):
-            found += _lines(value, f"{name}.") if value else [f"{name} = {{}}"]
-        elif value and isinstance(value, list) and isinstance(value[0], dict):
-            items = ", ".join("{" + ", ".join(_lines(entry, "")) + "}" for entry in value)
-            found.append(f"{name} = [{items}]")
-        else:
-            found.append(f"{name} = {json.dumps(value)}")
-    return found

@@ -339,8 +339,4 @@ def test_evaluate_command_refuses_bad_input_in_one_line(trained: Path, tmp_path:
         ((trained, "--protocol", "oflin"), "unknown protocol 'oflin'; did you mean offline"),
         ((trained, "--episodes", "0"), "--episodes"),
     ):
-        code, output, errors = call("evaluate", *arguments)
-        assert (code, output) == (2, "")
-        (line,) = errors.strip().splitlines()
-        assert line.startswith("Error: ")
-        assert expected in line
+        assert_refused(call("evaluate", *arguments), expected)

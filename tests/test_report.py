@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from tcmrl_cli.train import tcmrl
 
-from tcmrl_algo import WrittenReport, run_experiment, write_report
+from tcmrl_algo import WrittenReport, write_report
 from tcmrl_algo.experiment.results import RunResult, read_result
-from tcmrl_algo.experiment.spec import read_experiment
 from tcmrl_algo.report.contexts import (
     Stored,
     TrainedContexts,
@@ -30,8 +29,6 @@ from tcmrl_algo.report.tables import (
     final_table,
 )
 from tcmrl_data import Dataset
-from tcmrl_data.foundation.records import read_record
-from tests import experiments
 from tests.commands import Call, assert_refused
 
 PROGRAM = tcmrl
@@ -40,24 +37,14 @@ PNG = b"\x89PNG"
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory, tiny_folder: Path) -> Path:
-    """The results folder of the small experiment with one seed."""
-    out = tmp_path_factory.mktemp("results") / "small"
-    experiment = read_experiment(experiments.tables(tiny_folder, seeds=[0]), place="test")
-    assert run_experiment(experiment, out, workers=2).failed == ()
-    return out
+def report(small_results: Path, tmp_path_factory: pytest.TempPathFactory) -> WrittenReport:
+    return write_report([small_results], tmp_path_factory.mktemp("report"))
 
 
 @pytest.fixture(scope="module")
-def report(results: Path, tmp_path_factory: pytest.TempPathFactory) -> WrittenReport:
-    return write_report([results], tmp_path_factory.mktemp("report"))
-
-
-@pytest.fixture(scope="module")
-def trained(results: Path) -> RunResult:
+def trained(small_results: Path) -> RunResult:
     """The finished run of TCMRL."""
-    folder = results / "runs/point-robot--tcmrl--seed0"
-    return read_result(folder)
+    return read_result(small_results / "runs/point-robot--tcmrl--seed0")
 
 
 def test_contexts_within_a_task_over_contexts_between_tasks() -> None:
@@ -137,7 +124,9 @@ def test_tables_are_markdown_and_csv() -> None:
     assert list(csv.reader(table.csv().splitlines())) == [["a|b", "c"], ["x|y", "1.23456"], ["", "12345.6"]]
 
 
-def test_a_report_holds_every_section_and_every_file_it_names(report: WrittenReport, results: Path) -> None:
+def test_a_report_holds_every_section_and_every_file_it_names(
+    report: WrittenReport, small_results: Path
+) -> None:
     text = report.report.read_text()
     for heading in ("Verdicts", "Learning curves", "Time and memory", "Contexts", "Attention"):
         assert f"# {heading}" in text
@@ -149,11 +138,11 @@ def test_a_report_holds_every_section_and_every_file_it_names(report: WrittenRep
         assert file.stat().st_size > 0
         if file.suffix == ".png":
             assert file.read_bytes().startswith(PNG)
-    result = read_record(RunResult, results / "runs/point-robot--tcmrl--seed0.json")
-    assert result.root in text
+    runs = [read_result(small_results / f"runs/point-robot--tcmrl--seed{seed}") for seed in (0, 1)]
+    assert runs[0].root in text
     (digests,) = (file for file in report.files if file.name.endswith("-digests.csv"))
-    assert digests.name in text and result.digest in digests.read_text()
-    table = final_table("x", [result])
+    assert digests.name in text and runs[0].digest in digests.read_text()
+    table = final_table("x", runs)
     assert f"{table.rows[0][3]:.4g}" in text
     assert [verdict.verdict for verdict in report.verdicts] == ["cannot tell"] * 3
     assert [verdict.protocol for verdict in report.verdicts] == ["offline", "paper", None]
@@ -168,12 +157,12 @@ def test_dataset_returns_are_those_of_its_parts(report: WrittenReport, tiny: Dat
 
 
 @pytest.fixture
-def copy(results: Path, tmp_path: Path) -> Path:
+def copy(small_results: Path, tmp_path: Path) -> Path:
     """The results without the runs' checkpoints."""
     copy = tmp_path / "copy"
     (copy / "runs").mkdir(parents=True)
-    shutil.copy(results / "experiment.json", copy)
-    for file in results.glob("runs/*.json"):
+    shutil.copy(small_results / "experiment.json", copy)
+    for file in small_results.glob("runs/*.json"):
         shutil.copy(file, copy / "runs")
     return copy
 
@@ -204,12 +193,12 @@ def test_a_report_names_the_runs_that_are_missing_and_why(copy: Path) -> None:
     report = write_report([copy], copy / "report")
     text = report.report.read_text()
     assert f"1 of its runs: `{lost.name}` (loss/critic is not finite at step 7)" in text
-    assert [verdict.pairs for verdict in report.verdicts] == [(), (), ()]  # no run, no checkpoint
+    assert [verdict.pairs for verdict in report.verdicts] == [((1, None),), ((1, None),), ()]
 
 
-def test_what_is_no_run_is_refused(results: Path, tmp_path: Path, call: Call) -> None:
+def test_what_is_no_run_is_refused(small_results: Path, tmp_path: Path, call: Call) -> None:
     assert_refused(call("report", tmp_path), "experiment.json")
-    shutil.copy(results / "experiment.json", tmp_path)
+    shutil.copy(small_results / "experiment.json", tmp_path)
     assert_refused(call("report", tmp_path), "no finished run")
     (tmp_path / "experiment.json").write_text("{")
     assert_refused(call("report", tmp_path), "experiment.json")
@@ -217,10 +206,10 @@ def test_what_is_no_run_is_refused(results: Path, tmp_path: Path, call: Call) ->
 
 @pytest.mark.check
 def test_a_moved_dataset_is_named_with_an_option(
-    results: Path, tiny_copy: Callable[[], Path], tmp_path: Path, call: Call
+    small_results: Path, tiny_copy: Callable[[], Path], tmp_path: Path, call: Call
 ) -> None:
     copied, moved = tmp_path / "results", tiny_copy()
-    shutil.copytree(results, copied)
+    shutil.copytree(small_results, copied)
     for file in copied.glob("runs/*.json"):
         file.write_text(json.dumps(json.loads(file.read_text()) | {"dataset": str(tmp_path / "gone")}))
     assert call("report", copied, "--quiet")[0] == 0

@@ -217,7 +217,7 @@ def test_the_command_prints_what_python_gives(
 
 
 def test_a_worth_above_all_is_explained(call: Call, tmp_path: Path) -> None:
-    """15.5 are gained over the best single policy. The best stored return is -2: 18 above -20, 13 above -15."""
+    """15.5 are gained over the best single policy. The best return is -2: 18 above -20, 13 above -15."""
     for uniform, shown in ((-20.0, "86.1%"), (-15.0, "119.2%")):
         references = References(uniform=uniform, oracle=None, scripted=None)
         dataset = walkers(tmp_path / shown, references)
