@@ -23,6 +23,7 @@ GONE = {
     "tcmrl completion": 'eval "$(_TCMRL_COMPLETE=bash_source tcmrl)" in ~/.bashrc',
     "tcmrl train --steps": "--stop-at",
     "tcmrl experiment --reuse": "--out with the folder of the finished runs, which it keeps",
+    "tcmrl-data inspect returns --recompute": "tcmrl-data verify DATASET --deep",
     "tcmrl-data import --task": "--first-task",
     "tcmrl-data import --tasks": "--task-file",
     "tcmrl-data extend --of": "--run (and --as for the name of the new run)",

@@ -2,14 +2,12 @@
 
 import json
 import math
-import shlex
 from pathlib import Path
 from typing import Any
 
 import click
 
 from .frame import (
-    fail_incomplete,
     number,
     output_options,
     print_json,
@@ -39,25 +37,19 @@ def inspect() -> None:
 @DATASET
 @output_options
 @PLOT
-@click.option(
-    "--recompute",
-    is_flag=True,
-    help="Compute the returns from the stored rewards and compare them with the recorded ones.",
-)
-def returns(dataset: Path, as_json: bool, plot: Path | None, recompute: bool) -> None:
+def returns(dataset: Path, as_json: bool, plot: Path | None) -> None:
     """Print undiscounted returns by snapshot, for training and test tasks.
 
     \b
-    Examples:
+    Example:
       tcmrl-data inspect returns data/point-robot --plot returns.png
-      tcmrl-data inspect returns data/point-robot --recompute --json
     """
     import tcmrl_data
-    from tcmrl_data.dataset.listing import first_disagreement, summarize_returns
+    from tcmrl_data.dataset.listing import summarize_returns
     from tcmrl_data.quality.scores import plot_returns
 
     opened = tcmrl_data.open_dataset(dataset)
-    table = tcmrl_data.list_returns(opened, recompute=recompute)
+    table = tcmrl_data.list_returns(opened)
     if plot is not None:
         plot_returns(opened, table, plot)
         remark(f"learning curves written to {plot}")
@@ -65,11 +57,6 @@ def returns(dataset: Path, as_json: bool, plot: Path | None, recompute: bool) ->
         print_json(table)
     else:
         _print_returns(table["name"], summarize_returns(table))
-    if recompute:
-        difference = first_disagreement(tcmrl_data.list_returns(opened), table)
-        if difference is not None:
-            command = shlex.join(["tcmrl-data", "verify", str(opened.folder), "--repair", "--deep"])
-            fail_incomplete(f"{opened.folder}: {difference}; run `{command}`")
 
 
 def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:

@@ -71,7 +71,6 @@ MEANINGS = {
     "--random-episodes": "how many adaptation episodes are random",
     "--ray-address": "the address of a Ray cluster",
     "--recipe": "only print the recipe",
-    "--recompute": "compute from stored rewards",
     "--repair": "make damaged parts again",
     "--repeats": "how many times a protocol is run",
     "--replay": "how many parts are replayed",

@@ -45,7 +45,6 @@ LOOKS = (
     "tcmrl-data build point-robot --recipe --profile quick",
     "tcmrl-data list data",
     "tcmrl-data inspect returns data/point-robot",
-    "tcmrl-data inspect returns data/point-robot --recompute",
     "tcmrl-data inspect tasks data/point-robot",
     "tcmrl-data inspect snapshots data/point-robot",
     "tcmrl-data inspect episodes data/point-robot",

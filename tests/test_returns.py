@@ -1,9 +1,7 @@
 import pytest
 
-import tcmrl_data
 from tcmrl_data import Dataset
 from tcmrl_data.dataset.listing import (
-    first_disagreement,
     list_episodes,
     list_snapshots,
     list_tasks,
@@ -82,21 +80,6 @@ def test_summary_is_over_tasks_with_splits_apart() -> None:
         },
     ]
     assert {row["success_rate"] for row in summarize_returns(table(0.25))} == {0.25}
-
-
-def test_a_disagreement_names_task_step_and_field() -> None:
-    changed = table()
-    changed["tasks"][2]["snapshots"][1]["max"] = 11.0  # type: ignore[index]
-    assert first_disagreement(table(), table()) is None
-    assert (
-        first_disagreement(table(), changed)
-        == "task 2 at step 10: max is 9.0 in parts.jsonl and 11.0 in the data"
-    )
-    assert first_disagreement(table(), table(1.0)) is not None
-
-
-def test_recomputed_returns_equal_the_recorded_ones(tiny: Dataset) -> None:
-    assert tcmrl_data.list_returns(tiny, recompute=True) == tcmrl_data.list_returns(tiny)
 
 
 def test_snapshot_and_task_tables_cover_the_dataset(tiny: Dataset) -> None:

@@ -23,7 +23,6 @@ from tcmrl_data.foundation.records import MAX_JSON_BYTES
 from tcmrl_data.remote.address import Address, is_url, parse_address
 from tcmrl_data.remote.published import find_datasets
 from tcmrl_data.store.manifest import EPISODES, FOLD, MANIFEST, Derivation
-from tcmrl_data.store.part_table import PartEntry
 from tcmrl_data.store.tables import PARTS
 
 
@@ -136,12 +135,11 @@ SPLITS: tuple[Split, ...] = ("train", "test")
 RETURN_FIELDS = ("episodes", "steps", "mean", "std", "min", "max", "success_rate")
 
 
-def list_returns(dataset: Dataset, recompute: bool = False) -> dict[str, Any]:
+def list_returns(dataset: Dataset) -> dict[str, Any]:
     """Returns per task and snapshot, the document of `tcmrl-data inspect returns --json`.
 
     Args:
         dataset: the dataset; of an incomplete one, what is there.
-        recompute: sum the stored rewards instead of reading the table of parts.
 
     Returns:
         `{"name", "environment", "tasks": [{"task", "split", "snapshots": [{"step", "run", "episodes",
@@ -160,7 +158,7 @@ def list_returns(dataset: Dataset, recompute: bool = False) -> dict[str, Any]:
                 "task": task.index,
                 "split": task.split,
                 "snapshots": [
-                    {"step": entry.step, "run": entry.run} | _returns(dataset, entry, recompute)
+                    {name: getattr(entry, name) for name in ("step", "run", *RETURN_FIELDS)}
                     for entry in dataset.parts.entries_of(task.index)
                 ],
             }
@@ -245,38 +243,8 @@ def summarize_returns(table: dict[str, Any]) -> list[dict[str, Any]]:
     return rows
 
 
-def first_disagreement(recorded: dict[str, Any], recomputed: dict[str, Any]) -> str | None:
-    """Where recomputed returns differ from the recorded ones, in words; None where they agree."""
-    for old, new in zip(recorded["tasks"], recomputed["tasks"], strict=True):
-        for before, after in zip(old["snapshots"], new["snapshots"], strict=True):
-            for field in RETURN_FIELDS:
-                if not _agree(before[field], after[field]):
-                    place = f"task {old['task']} at step {before['step']}"
-                    return (
-                        f"{place}: {field} is {before[field]} in parts.jsonl and {after[field]} in the data"
-                    )
-    return None
-
-
 def _heading(dataset: Dataset) -> dict[str, Any]:
     return {"name": dataset.manifest.name, "environment": dataset.name}
-
-
-def _returns(dataset: Dataset, entry: PartEntry, recompute: bool) -> dict[str, Any]:
-    if not recompute:
-        return {field: getattr(entry, field) for field in RETURN_FIELDS}
-    trajectories = dataset.trajectories(*entry.key)
-    returns = np.array([trajectory.undiscounted_return for trajectory in trajectories])
-    success = [flag for flag in map(_success, trajectories) if flag is not None]
-    return {
-        "episodes": len(trajectories),
-        "steps": sum(map(len, trajectories)),
-        "mean": float(returns.mean()),
-        "std": float(returns.std()),
-        "min": float(returns.min()),
-        "max": float(returns.max()),
-        "success_rate": float(np.mean(success)) if success else None,
-    }
 
 
 def _episode(trajectory: Trajectory) -> dict[str, Any]:
@@ -285,24 +253,14 @@ def _episode(trajectory: Trajectory) -> dict[str, Any]:
         "return": trajectory.undiscounted_return,
         "terminated": bool(trajectory.terminated.any()),
         "truncated": bool(trajectory.truncated.any()),
-        "success": _success(trajectory),
+        "success": bool(np.any(trajectory.extras["success"])) if "success" in trajectory.extras else None,
     }
-
-
-def _success(trajectory: Trajectory) -> bool | None:
-    return bool(np.any(trajectory.extras["success"])) if "success" in trajectory.extras else None
 
 
 def _at(table: dict[str, Any], step: int, split: str) -> Iterator[dict[str, Any]]:
     for task in table["tasks"]:
         if task["split"] == split:
             yield from (found for found in task["snapshots"] if found["step"] == step)
-
-
-def _agree(recorded: float | None, recomputed: float | None) -> bool:
-    if recorded is None or recomputed is None:
-        return recorded is recomputed
-    return bool(np.isclose(recorded, recomputed, rtol=1e-9, atol=1e-9))
 
 
 LARGEST = 1e300
