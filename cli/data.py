@@ -25,7 +25,7 @@ from .groups import SETTINGS, Commands
 from .inspection import inspect
 from .keeping import cache, delete, verify
 from .looking import dataset_report, diff, render
-from .making import build, import_data, import_policy
+from .making import build, import_data
 from .new import new
 from .options import DATASET, DATASET_PATH
 from .remote import pull, push
@@ -211,7 +211,7 @@ def _progress(status: "BuildStatus") -> dict[str, str]:
 
 data.fill(
     {
-        "Make": [build, new, import_data, import_policy],
+        "Make": [build, new, import_data],
         "Look": [envs, list_, show, inspect, diff, dataset_report, render],
         "Change": [derive, merge, extend, relabel],
         "Keep": [verify, delete, cache],

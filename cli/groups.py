@@ -24,6 +24,7 @@ GONE = {
     "tcmrl train --steps": "--stop-at",
     "tcmrl experiment --reuse": "--out with the folder of the finished runs, which it keeps",
     "tcmrl-data inspect returns --recompute": "tcmrl-data verify DATASET --deep",
+    "tcmrl-data import-policy": "stable_baselines3.SAC.load in Python; no command read its output",
     "tcmrl-data import --task": "--first-task",
     "tcmrl-data import --tasks": "--task-file",
     "tcmrl-data extend --of": "--run (and --as for the name of the new run)",

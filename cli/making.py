@@ -1,4 +1,4 @@
-"""`tcmrl-data build`, `import` and `import-policy`."""
+"""`tcmrl-data build` and `import`."""
 
 import dataclasses
 import json
@@ -415,33 +415,3 @@ def _option(text: str) -> tuple[str, Any]:
     if not equals:
         raise click.UsageError(f"--option {text!r}: expected NAME=VALUE")
     return name, int(value) if value.isdecimal() else value
-
-
-@click.command(name="import-policy")
-@click.argument("zip_file", metavar="ZIP", type=PATH)
-@click.option("--out", type=PATH, required=True, metavar="FOLDER", help="Folder to create.")
-@click.option(
-    "--observation",
-    type=click.Choice(["stored", "full"]),
-    default="stored",
-    show_default=True,
-    help="Observation that the policy was trained on.",
-)
-@output_options
-def import_policy(zip_file: Path, as_json: bool, out: Path, observation: str) -> None:
-    """Convert the SAC actor of a Stable-Baselines3 ZIP to a policy.
-
-    The new folder contains policy.json and policy.safetensors. No pickle of ZIP is run.
-
-    \b
-    Example:
-      tcmrl-data import-policy sac.zip --out policies/sac
-    """
-    import tcmrl_data
-
-    snapshot = tcmrl_data.import_sac(zip_file, out, observation="full" if observation == "full" else "stored")
-    files = {name: len(content) for name, content in snapshot.files().items()}
-    if as_json:
-        print_json({"out": str(out), "step": snapshot.step, "files": files, "digest": snapshot.digest()})
-    else:
-        click.echo(f"{out}: {', '.join(files)}, {size(sum(files.values()))}, digest {snapshot.digest()[:12]}")

@@ -1,5 +1,4 @@
 from .behavior.base import BEHAVIOR_SOURCES as BEHAVIOR_SOURCES
-from .behavior.sb3_zip import import_sac as import_sac
 from .building.build import BuildReport as BuildReport
 from .building.build import build_dataset as build_dataset
 from .building.forecast import Forecast as Forecast

@@ -58,7 +58,6 @@ MEANINGS = {
     "--move": "let a tag name another dataset",
     "--names": "names of several datasets",
     "--noise": "the standard deviation of noise on actions",
-    "--observation": "which observation a policy reads",
     "--only": "the method to run",
     "--option": "an option of an import format",
     "--out": "where to write",
