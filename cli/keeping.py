@@ -48,7 +48,7 @@ MOST_LINES = 20
     multiple=True,
     type=PATH,
     metavar="DATASET",
-    help="A dataset that DATASET was derived from; name all, and the derivation is done again and compared.",
+    help="With --deep or --replay: a dataset with parts that parts of DATASET were made from.",
 )
 @click.option("--repair", is_flag=True, help="Make damaged and missing parts again.")
 @click.option(

@@ -81,7 +81,7 @@ MEANINGS = {
     "--seeds": "seeds of runs",
     "--set": "a setting and its value",
     "--snapshots": "a rule that chooses snapshots",
-    "--source": "a dataset that this one was derived from",
+    "--source": "a dataset with parts that others were made from",
     "--split": "the split whose tasks are taken",
     "--split-from": "the dataset whose split is taken",
     "--step": "the training step of a snapshot",

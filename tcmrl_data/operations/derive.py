@@ -341,23 +341,6 @@ class Choice:
         del values["held_out"]
         return values | ({"held_out": sorted(set(self.held_out))} if self.held_out else {})
 
-    @classmethod
-    def from_json(cls, settings: dict[str, Any]) -> "Choice":
-        """The inverse of `to_json`; further settings are left aside.
-
-        Raises:
-            KeyError, TypeError, SelectionError: settings of another form.
-        """
-        settings = {"held_out": (), **settings}
-        values = {name: settings[name] for name in cls.__dataclass_fields__}
-        tasks = values["tasks"]
-        lists = {
-            "tasks": None if tasks is None else tuple(tasks),
-            "drop_arrays": tuple(values["drop_arrays"]),
-            "held_out": tuple(values["held_out"]),
-        }
-        return cls(**values | lists)
-
 
 def plan_subset(source: Dataset, choice: Choice, *, label: str | None = None) -> Plan:
     """The dataset of a choice.

@@ -1,7 +1,7 @@
-"""Parts and derivations made again, and compared with what is stored."""
+"""Parts made again, and compared with what is stored."""
 
 import contextlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -10,13 +10,7 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import ValidationError
 
-from tcmrl_data.dataset.dataset import Dataset
-from tcmrl_data.foundation.errors import ManifestError, SelectionError, SnapshotError, StoreError, TcmrlError
-from tcmrl_data.foundation.files import one_line
-from tcmrl_data.operations.assembly import Plan, PlannedPart
-from tcmrl_data.operations.derive import Choice, plan_subset
-from tcmrl_data.operations.merge import MERGE, plan_merge
-from tcmrl_data.operations.split import plan_episodes, plan_fold
+from tcmrl_data.foundation.errors import ManifestError, SnapshotError, StoreError, TcmrlError
 from tcmrl_data.parts.making import one_thread
 from tcmrl_data.parts.operation import (
     MissingSourceError,
@@ -31,10 +25,10 @@ from tcmrl_data.parts.own_operations import SUBSET, operation_of
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import DECODED_FLOOR, DECODED_RATIO, pack, read_arrays
-from tcmrl_data.store.manifest import EPISODES, FOLD, MANIFEST, Derivation, Run
+from tcmrl_data.store.manifest import Run
 from tcmrl_data.store.part import PartRecord, read_part_record
 from tcmrl_data.store.part_table import PartTable
-from tcmrl_data.store.tables import TASKS, PartKey, part_file
+from tcmrl_data.store.tables import PartKey, part_file
 from tcmrl_data.verification.description import NO_SOURCE
 
 FIRST_STEPS = 5
@@ -125,25 +119,26 @@ def derived_problems(
 ) -> Iterator[tuple[str, str]]:
     """Makes the parts that were made from others again, and yields files and how they differ: forged ones do.
 
-    Parts of another platform are left out, since they come out with other bits here.
+    Simulated parts of another platform are left out, since they come out with other bits here, and cut parts
+    whose source is not at hand.
 
     Args:
         files: of the parts that others may be made from, by their ids.
         only: files of the parts that are made again.
     """
-    chosen = {name for name, run in runs.items() if run.kind != "built" and can_be_made_again(run)}
-    if not chosen:
-        return
     keys = {entry.id: entry.key for entry in table.entries()}
     for entry in table.entries():
-        file, recipe = part_file(entry.key), runs[entry.run].recipe if entry.run in chosen else None
-        if recipe is None or file not in only:
+        file, run = part_file(entry.key), runs[entry.run]
+        if run.recipe is None or run.kind == "built" or file not in only:
             continue
         with contextlib.ExitStack() as stack:
             archive = stack.enter_context(Archive(folder / file))
             record = read_part_record(archive)
-            replay = replay_part(archive, record, entry.key, recipe, files)
-            if replay is None:
+            is_cut = (record.identity.derived or {}).get("operation") == SUBSET
+            if not is_cut and not can_be_made_again(run):
+                continue
+            replay = replay_part(archive, record, entry.key, run.recipe, files)
+            if replay is None and not is_cut:
                 yield file, NO_SOURCE
             for problem in replay.problems if replay is not None and replay.exact else ():
                 yield file, f"made again: {problem}"
@@ -228,96 +223,3 @@ def _drift_problems(
 def _returns(arrays: Mapping[str, npt.NDArray[Any]]) -> npt.NDArray[np.float64]:
     sums = np.concatenate([[0.0], np.cumsum(arrays["rewards"], dtype=np.float64)])
     return np.diff(sums[arrays["episode_offsets"]])
-
-
-def derivation_problems(
-    dataset: Dataset, sources: Sequence[Dataset], *, made_again: bool
-) -> Iterator[tuple[str, str]]:
-    """Does a dataset's derivation again, without writing, and yields files and how they differ.
-
-    Args:
-        sources: the datasets that it was derived from, in any order.
-        made_again: its parts have been made again from those of the sources, which says enough of operations
-            whose plan cannot be made again.
-
-    Raises:
-        SelectionError: the dataset was not derived, a source is missing, or the operation cannot be done
-            again here.
-    """
-    derivation = dataset.manifest.derivation
-    if derivation is None:
-        raise SelectionError(f"--source: {dataset.path} was not derived from other datasets")
-    ordered = _in_order(derivation, sources)
-    plan_again = _PLANS.get(derivation.operation)
-    if plan_again is None and not made_again:
-        raise SelectionError(
-            f"--source: {derivation.operation!r} cannot be planned again to compare; add --deep, which makes "
-            "its parts again"
-        )
-    if plan_again is None:
-        return
-    try:
-        plan = plan_again(ordered, derivation.settings)
-    except (TcmrlError, KeyError, TypeError, ValueError, IndexError) as error:
-        yield MANIFEST, f"derivation cannot be done again ({one_line(error)})"
-        return
-    yield from _plan_problems(dataset, plan)
-
-
-def _in_order(derivation: Derivation, sources: Sequence[Dataset]) -> list[Dataset]:
-    ordered, left = [], sorted(sources, key=lambda source: source.manifest.digest)
-    for wanted in derivation.sources:
-        found = next((source for source in left if source.manifest.root == wanted.root), None)
-        if found is None:
-            raise SelectionError(
-                f"--source: the derivation reads a dataset {wanted.label or ''} with root "
-                f"{wanted.root[:12]}; name its folder"
-            )
-        left.remove(found)
-        ordered.append(found)
-    return ordered
-
-
-def _plan_problems(dataset: Dataset, plan: Plan) -> Iterator[tuple[str, str]]:
-    if dataset.tasks != plan.tasks:
-        yield TASKS, "does not hold the tasks and splits that the derivation gives"
-    planned = {part.key: part for part in plan.parts}
-    for key in sorted(set(dataset.parts) ^ set(planned)):
-        yield part_file(key), f"is {'left out' if key in planned else 'taken'} against the derivation"
-    for entry in dataset.parts.entries():
-        part = planned.get(entry.key)
-        if part is not None and entry.id != _id_of(part):
-            yield part_file(entry.key), f"is not what the derivation gives from {part.source.path}"
-
-
-def _id_of(part: PlannedPart) -> str:
-    return part.source.entry(part.source_key).id if part.operation is None else part.make()[0].id
-
-
-def _subset(sources: Sequence[Dataset], settings: dict[str, Any]) -> Plan:
-    (source,) = sources
-    return plan_subset(source, Choice.from_json(settings))
-
-
-def _merge(sources: Sequence[Dataset], settings: dict[str, Any]) -> Plan:
-    deciding = settings["split_from"]
-    split_from = None if deciding is None else sources[deciding].manifest.digest
-    return plan_merge(sources, names=settings["names"], split_from=split_from)
-
-
-def _fold(sources: Sequence[Dataset], settings: dict[str, Any]) -> Plan:
-    (source,) = sources
-    return plan_fold(source, folds=settings["folds"], seed=settings["seed"], fold=settings["fold"])
-
-
-def _episodes(sources: Sequence[Dataset], settings: dict[str, Any]) -> Plan:
-    (source,) = sources
-    return plan_episodes(source, first=settings["first"], number=settings["number"])
-
-
-_PLANS: dict[str, Callable[[Sequence[Dataset], dict[str, Any]], Plan]] = {
-    SUBSET: _subset,
-    MERGE: _merge,
-    FOLD: _fold,
-    EPISODES: _episodes,
-}

@@ -45,7 +45,6 @@ from tcmrl_data.verification.description import (
 )
 from tcmrl_data.verification.replay import (
     Replay,
-    derivation_problems,
     derived_problems,
     replay_part,
 )
@@ -91,13 +90,11 @@ def verify_dataset(
         sample: number of parts, spread over the dataset, of which more than name and size is checked; all
             where None.
         strict: files of others beside the data are findings.
-        sources: datasets that a derived dataset was made of; its derivation is done again and compared, and
-            parts are made again from theirs.
+        sources: datasets with parts that parts of this one were made from, to make these again.
         progress: called with parts done and parts in all.
 
     Raises:
         ManifestError: there is no dataset at the path, or it is a view.
-        SelectionError: `sources` of a dataset that was not derived, or not all of them.
 
     Example:
         >>> verify_dataset("data/point-robot", level="deep").findings  # doctest: +SKIP
@@ -114,7 +111,6 @@ def verify_dataset(
     run = _Verification(folder, level, is_locked=False, sample=sample, sources=opened)
     parts = run.check(progress)
     replays = run.replay(replay)
-    run.derive_again()
     sizes = [status.st_size for status in run.scan.files.values()]
     seconds = time.monotonic() - started
     found = run.sorted_findings()
@@ -221,14 +217,6 @@ class _Verification:
                 for problem in replay.problems:
                     self._add(part_file(key), f"replay: {problem}")
         return tuple(replays)
-
-    def derive_again(self) -> None:
-        """Does the derivation again, if sources are given and nothing is damaged, and compares."""
-        manifest = self._description.manifest
-        if self._sources and manifest is not None and all(found.note for found in self.findings):
-            dataset, made_again = Dataset(self._folder, manifest), self._level == "deep"
-            for file, problem in derivation_problems(dataset, self._sources, made_again=made_again):
-                self._add(file, f"derivation: {problem}")
 
     def _files_of_parts(self) -> dict[str, Path]:
         """The files of the sound parts of the dataset and its sources, by their ids."""
