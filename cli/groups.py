@@ -16,7 +16,7 @@ GONE = {
     "tcmrl-data gc": "tcmrl-data verify DATASET --clean",
     "tcmrl-data split": "tcmrl-data derive DATASET --folds K, or --episodes 45,5",
     "tcmrl-data rename": "--label when the dataset is made, or tcmrl_data.rename_dataset in Python",
-    "tcmrl-data cite": "tcmrl-data card DATASET --format bibtex, or cff, or text",
+    "tcmrl-data cite": "tcmrl-data card DATASET --format bibtex, or cff",
     "tcmrl-data croissant": "tcmrl-data card DATASET --format croissant",
     "tcmrl-data schema": "the files in docs/schema, or tcmrl_data.describe.schema.json_schema in Python",
     "tcmrl-data completion": 'eval "$(_TCMRL_DATA_COMPLETE=bash_source tcmrl-data)" in ~/.bashrc',

@@ -109,10 +109,10 @@ def export(
 @click.option(
     "--format",
     "form",
-    type=click.Choice(["readme", "bibtex", "cff", "text", "croissant"]),
+    type=click.Choice(["readme", "bibtex", "cff", "croissant"]),
     default="readme",
     show_default=True,
-    help="A README, a citation (BibTeX, Citation File Format 1.2, sentences), or Croissant 1.0.",
+    help="A README, a citation (BibTeX, Citation File Format 1.2), or Croissant 1.0.",
 )
 @click.option(
     "--out",

@@ -48,7 +48,6 @@ from .foundation.errors import CheckpointError as CheckpointError
 from .foundation.errors import RenderingError as RenderingError
 from .foundation.errors import SelectionError as SelectionError
 from .foundation.errors import TcmrlError as TcmrlError
-from .foundation.errors import TierError as TierError
 from .foundation.errors import TrainingError as TrainingError
 from .foundation.machine import cache_folder as cache_folder
 from .foundation.machine import cache_limit as cache_limit

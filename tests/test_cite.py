@@ -5,12 +5,10 @@ from typing import Any
 import bibtexparser
 import pytest
 import yaml
-from tcmrl_cli.data import data
 
 from tcmrl_data import Dataset, Manifest
 from tcmrl_data.describe.cite import citation_text
 from tcmrl_data.recipe.document import About, Reference, is_listed
-from tests.commands import in_process
 from tests.workers import ROOT
 
 HOSTILE = About(
@@ -105,22 +103,6 @@ def test_a_licence_that_cff_does_not_know_stands_in_the_abstract(tiny: Dataset) 
         document = yaml.safe_load(citation_text(with_about(tiny.manifest, about), "cff"))
         assert "license" not in document
         assert document["abstract"] == f"Licence: {licence}."
-
-
-def test_the_text_names_authors_version_and_works(tiny: Dataset, capsys: pytest.CaptureFixture[str]) -> None:
-    call = in_process(data, capsys)
-    code, output, _ = call("card", tiny.folder, "--format", "text")
-    first, *works, software = output.splitlines()
-    assert code == 0
-    assert first.startswith("the tcmrl authors: point-robot: a dataset for offline")
-    assert f"version {tiny.manifest.root[:12]}, licence MIT." in first
-    assert works == [
-        "Kate Rakelly, Aurick Zhou, Deirdre Quillen, Chelsea Finn, Sergey Levine: Efficient Off-Policy "
-        "Meta-Reinforcement Learning via Probabilistic Context Variables. International Conference on "
-        "Machine Learning, 2019. https://arxiv.org/abs/1903.08254"
-    ]
-    assert software.startswith("the tcmrl authors: tcmrl")
-    assert call("card", tiny.folder, "--format", "bibtex")[1] == citation_text(tiny.manifest, "bibtex")
 
 
 def test_the_softwares_own_cff_parses() -> None:

@@ -151,7 +151,7 @@ def test_the_argument_is_called_dataset_everywhere() -> None:
     }
     assert {metavar for name, metavar in named if name in ("dataset", "left")} == {"DATASET"}
     assert {metavar for _, metavar in named} == {
-        *("DATASET", "OTHER", "DATASET…", "ENV|FILE", "URL", "OUT", "FORMAT", "FILE…", "ZIP", "[FOLDER]"),
+        *("DATASET", "OTHER", "DATASET…", "ENV|FILE", "URL", "OUT", "FORMAT", "FILE…", "[FOLDER]"),
         *("RUN", "RUNS...", "FILE|NAME", "NAME"),
     }
 

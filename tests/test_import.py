@@ -234,7 +234,7 @@ def test_the_command(exported: list[Path], tmp_path: Path, capsys: pytest.Captur
     assert "exists and is not empty" in capsys.readouterr().err
     other = ["import", "hdf5", str(exported[0]), "--out", str(tmp_path / "other")]
     for more, message in (
-        (["--option", "layout=lerobot"], "layout"),
+        (["--option", "layout=robomimic"], "layout"),
         (["--option", "layout"], "expected NAME=VALUE"),
         (["--environment", "nowhere"], "unknown environment 'nowhere'"),
         (["--task-file", str(tmp_path / "no.json")], "no.json cannot be read"),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from tcmrl_data.behavior.base import BehaviorContext, BehaviorSource, CheckpointFolder, Snapshot
+from tcmrl_data.behavior.base import BehaviorSource, CheckpointFolder, Snapshot
 from tcmrl_data.building.plan import BuildPlan, PartMaker, UnitSpec
 from tcmrl_data.engine.base import ENGINES, Unit
 from tcmrl_data.engine.local import Send
@@ -251,17 +251,8 @@ def work(values: dict[str, Any], send: Send) -> str:
     plan = _probe_plan(spec)
     source = plan.source.with_warmup(WARMUP_STEPS)
     clock = Clock(source.warmup_steps * len(spec.tasks))
-    context = BehaviorContext(
-        environment=plan.environment,
-        tasks=spec.tasks,
-        seed=spec.seed,
-        observation=spec.recipe.behavior.observation,
-        reward=spec.recipe.behavior.reward,
-        report=clock.report,
-        checkpoints=lambda tasks: CheckpointFolder(
-            Path(os.devnull), "", key="", missing={}, seconds=math.inf
-        ),
-    )
+    nowhere = CheckpointFolder(Path(os.devnull), "", key="", missing={}, seconds=math.inf)
+    context = spec.context(plan, clock.report, lambda tasks: nowhere)
     started = time.monotonic()
     try:
         for index, (task, snapshot) in enumerate(source.snapshots(context)):

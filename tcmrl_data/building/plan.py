@@ -2,7 +2,7 @@
 
 import contextlib
 import functools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, final
@@ -178,6 +178,24 @@ class UnitSpec:
     dropped: frozenset[int] = frozenset()
     checkpoint_seconds: float = CHECKPOINT_SECONDS
 
+    def context(
+        self,
+        plan: BuildPlan,
+        report: Callable[[int], None],
+        checkpoints: Callable[[Sequence[Task]], CheckpointFolder],
+    ) -> BehaviorContext:
+        """What the behavior source receives to make the policies of the unit."""
+        behavior = self.recipe.behavior
+        return BehaviorContext(
+            plan.environment,
+            self.tasks,
+            self.seed,
+            behavior.observation,
+            behavior.reward,
+            report,
+            checkpoints,
+        )
+
 
 def run_unit(spec: UnitSpec, report: Send) -> str:
     """Makes every missing part of the unit's tasks; parts already published are left alone.
@@ -258,14 +276,10 @@ def _part_id(file: Path) -> str:
 
 def _make_parts(spec: UnitSpec, plan: BuildPlan, missing: Mapping[int, Sequence[int]], report: Send) -> None:
     source = plan.source
-    context = BehaviorContext(
-        environment=plan.environment,
-        tasks=spec.tasks,
-        seed=spec.seed,
-        observation=spec.recipe.behavior.observation,
-        reward=spec.recipe.behavior.reward,
-        report=lambda count: report({"kind": "steps", "count": count}),
-        checkpoints=lambda tasks: _checkpoints(spec, plan, tasks, missing, report),
+    context = spec.context(
+        plan,
+        lambda count: report({"kind": "steps", "count": count}),
+        lambda tasks: _checkpoints(spec, plan, tasks, missing, report),
     )
     recorded = source.provenance()
     with contextlib.ExitStack() as stack:

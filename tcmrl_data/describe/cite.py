@@ -1,4 +1,4 @@
-"""How to cite a dataset, the works that it is from, and this software: BibTeX, CFF or plain text."""
+"""How to cite a dataset, the works that it is from, and this software: BibTeX or CFF."""
 
 import contextlib
 import re
@@ -14,7 +14,7 @@ from tcmrl_data.recipe.document import AND, Reference, is_listed
 from tcmrl_data.recipe.recipe import load_recipe
 from tcmrl_data.store.manifest import Manifest
 
-CitationFormat = Literal["bibtex", "cff", "text"]
+CitationFormat = Literal["bibtex", "cff"]
 
 UNKNOWN_AUTHORS = ("unknown",)
 """Of a work that names none; the Citation File Format asks for at least one."""
@@ -83,7 +83,7 @@ def _works_of(manifest: Manifest) -> tuple[Reference, ...]:
 def citation_text(manifest: Manifest, form: CitationFormat) -> str:
     """The citation of a dataset in a format, ending with a line end."""
     citation = citation_of(manifest)
-    return {"bibtex": _bibtex, "cff": _cff, "text": _text}[form](citation)
+    return {"bibtex": _bibtex, "cff": _cff}[form](citation)
 
 
 def _bibtex(citation: Citation) -> str:
@@ -197,29 +197,3 @@ def _cff_reference(work: Reference) -> dict[str, Any]:
 def _cff_author(name: str) -> dict[str, str]:
     family, comma, given = (part.strip() for part in name.partition(","))
     return {"family-names": family, "given-names": given} if comma and given else {"name": name}
-
-
-def _text(citation: Citation) -> str:
-    where = f" https://doi.org/{citation.doi}" if citation.doi else f" {citation.url}" if citation.url else ""
-    lines = [
-        f"{_names(citation.authors)}: {citation.title}, version {citation.version}, "
-        f"licence {AND.join(citation.licences)}.{where}",
-        *(_reference_text(work) for work in citation.references),
-        f"{_names(SOFTWARE_AUTHORS)}: {SOFTWARE_TITLE}, version {citation.software}.",
-    ]
-    return "".join(f"{line}\n" for line in lines)
-
-
-def _reference_text(work: Reference) -> str:
-    place = ", ".join(str(part) for part in (work.venue, work.year) if part)
-    where = f"https://doi.org/{work.doi}" if work.doi else work.url
-    sentences = (f"{_names(work.authors or UNKNOWN_AUTHORS)}: {work.title}.", place and f"{place}.", where)
-    return " ".join(filter(None, sentences))
-
-
-def _names(authors: Sequence[str]) -> str:
-    readable = [
-        f"{given.strip()} {family}" if given else family
-        for family, _, given in (name.partition(",") for name in authors)
-    ]
-    return ", ".join(readable)

@@ -53,10 +53,6 @@ class SelectionError(TcmrlError):
     """A selection of tasks, snapshots or trajectories that is empty or not allowed."""
 
 
-class TierError(SelectionError):
-    """A quality tier whose snapshots are not as good or bad as its name says."""
-
-
 class RequestError(TcmrlError):
     """A batch request with invalid numbers, or with names that contradict each other."""
 

@@ -116,28 +116,18 @@ def _append(group: h5py.Group, arrays: Mapping[str, npt.NDArray[Any]]) -> None:
         flat[rows:] = array
 
 
-class Hdf5Options(ObservationOptions):
-    """Options of the HDF5 reader; `observation_keys` are those of robomimic's layout.
-
-    Attributes:
-        layout: of the file, instead of the one that its content suggests.
-    """
-
-    layout: Layout | None = None
-
-
 @final
 class Hdf5Reader(Reader):
-    """One file is one task."""
+    """One file is one task; the option `observation_keys` is of robomimic's layout."""
 
     name = "hdf5"
-    Options = Hdf5Options
-    options: Hdf5Options
+    Options = ObservationOptions
+    options: ObservationOptions
 
     def read(self, path: Path, say: Say | None = None) -> Iterator[ReadPart]:
         cuts = EpisodeCuts()
         with Hdf5File(path) as file:
-            layout = self.options.layout or _layout_of(file)
+            layout = _layout_of(file)
             if layout == "robomimic":
                 yield from read_robomimic(file, self.options.keys(), cuts)
             elif layout == "tcmrl":
@@ -166,7 +156,7 @@ def _layout_of(file: Hdf5File) -> Layout:
         return "robomimic"
     raise StoreError(
         f"{file.path}: is of no known layout (d4rl: {missing} missing; robomimic: /data missing; tcmrl: "
-        "attribute format missing); name one with --option layout=NAME"
+        "attribute format missing)"
     )
 
 

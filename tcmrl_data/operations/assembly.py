@@ -224,7 +224,7 @@ class Assembly:
 
     def _copy(self, part: PlannedPart) -> PartEntry:
         target, entry = self._out / part_file(part.key), part.entry
-        if not _holds(target, entry):
+        if not holds_part(target, entry):
             place_file(target, part.source.content(part.source_key), staging=self._out / STAGING)
         return entry._replace(run=part.key.run)
 
@@ -236,10 +236,8 @@ class Assembly:
         return entry
 
 
-def _holds(file: Path, entry: PartEntry) -> bool:
+def holds_part(file: Path, entry: PartEntry) -> bool:
     """Whether a part is in its place; after a crash its file may hold anything."""
-    if not file.is_file():
-        return False
     try:
         return sha256(read_plain_file(file, limit=entry.size)) == entry.sha256
     except (OSError, ValueError):
@@ -260,18 +258,21 @@ def open_assembly(out: Path, derivation: Derivation, sources: Sequence[Dataset])
 
 def check_out(out: Path, derivation: Derivation) -> None:
     """Refuses a folder that is neither new nor one where the same assembly was stopped."""
+    check_folder(out, _note(derivation))
+
+
+def check_folder(out: Path, note: bytes) -> None:
+    """Refuses a folder that is neither new nor one where what the note says was stopped."""
     if not out.exists():
         return
     if not out.is_dir():
-        raise StoreError(f"--out {out} is a file; choose another folder")
+        raise StoreError(f"{out} is a file; choose another folder")
     check_work_files(out)
     begun = out / ASSEMBLY
     if not begun.exists() and {entry.name for entry in out.iterdir()} - {LOCK, STAGING}:
-        raise StoreError(f"--out {out} exists and is not empty; choose another folder or remove it")
-    if begun.exists() and read_plain_file(begun, limit=LARGEST_ARCHIVE) != _note(derivation):
-        raise StoreError(
-            f"--out {out} holds the beginning of another dataset; choose another folder or remove it"
-        )
+        raise StoreError(f"{out} exists and is not empty; choose another folder or remove it")
+    if begun.exists() and read_plain_file(begun, limit=LARGEST_ARCHIVE) != note:
+        raise StoreError(f"{out} holds the beginning of another dataset; choose another folder or remove it")
 
 
 def _note(derivation: Derivation) -> bytes:

@@ -21,7 +21,7 @@ from tcmrl_data.dataset.selection import (
 )
 from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.foundation.disk import LOCK, lock_file, replace_file
-from tcmrl_data.foundation.errors import SelectionError, StoreError, TierError
+from tcmrl_data.foundation.errors import SelectionError, StoreError
 from tcmrl_data.foundation.records import hidden_text, parse_json, sealed, write_ranges
 from tcmrl_data.foundation.seeding import Purpose, keyed_generator
 from tcmrl_data.operations.assembly import (
@@ -93,8 +93,6 @@ def derive_dataset(
     min_return: float | None = None,
     drop_arrays: Sequence[str] = (),
     label: str | None = None,
-    tolerance: float = TOLERANCE,
-    strict: bool = False,
     dry_run: bool = False,
     progress: Progress | None = None,
 ) -> Derived:
@@ -118,14 +116,11 @@ def derive_dataset(
         min_return: only episodes whose undiscounted return reaches it; parts without one are left out.
         drop_arrays: extra arrays, such as `success`, that are left out.
         label: the new dataset's own name.
-        tolerance: distance from a score of 33 up to which a medium snapshot is near it.
-        strict: refuse a tier whose medium snapshots are not near 33.
         dry_run: only say what would be made.
         progress: called with parts done and parts in all.
 
     Raises:
         SelectionError: the choice cannot be read, contradicts itself, or leaves nothing of a task.
-        TierError: with `strict`, a medium snapshot is not near 33.
         TaskError: an index that the dataset does not hold.
         StoreError: `out` or `view` exists, or a part is damaged, or the source has changed meanwhile.
         StorageError: the operating system refuses an operation.
@@ -144,9 +139,6 @@ def derive_dataset(
     indices = None if tasks is None else tuple(tasks)
     choice = Choice(rule, indices, split, episodes, seed, min_return, tuple(drop_arrays), tuple(held_out))
     plan = plan_subset(opened, choice, label=label)
-    far = _far_from_medium(plan, rule, tolerance)
-    if strict and far:
-        raise TierError(f"{opened.path}: not near a score of {MEDIUM_SCORE:g}: {describe_far(far)}")
     target = Path(out if out is not None else view or "")
     root = None
     if view is not None:
@@ -157,7 +149,7 @@ def derive_dataset(
         carry_out(plan, target, progress)
     if not dry_run:
         root = (read_manifest(target) if view is None else open_dataset(target).manifest).root
-    return summary(plan, target, root=root, far=far)
+    return summary(plan, target, root=root, far=_far_from_medium(plan, rule))
 
 
 def summary(plan: Plan, out: Path, *, root: str | None, far: dict[str, float] | None = None) -> Derived:
@@ -196,12 +188,12 @@ def _write_view(plan: Plan, file: Path, *, dry_run: bool) -> None:
         )
 
 
-def _far_from_medium(plan: Plan, rule: str, tolerance: float) -> dict[str, float]:
+def _far_from_medium(plan: Plan, rule: str) -> dict[str, float]:
     if "medium" not in rule:
         return {}
     (source,) = plan.sources
     scores = medium_scores(source, [task.index for task in plan.tasks])
-    return {str(key): score for key, score in scores.items() if abs(score - MEDIUM_SCORE) > tolerance}
+    return {str(key): score for key, score in scores.items() if abs(score - MEDIUM_SCORE) > TOLERANCE}
 
 
 def write_view(

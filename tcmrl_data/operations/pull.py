@@ -17,8 +17,7 @@ from tcmrl_data.foundation.disk import (
     sync_files,
 )
 from tcmrl_data.foundation.errors import StoreError
-from tcmrl_data.foundation.files import read_plain_file
-from tcmrl_data.foundation.records import sha256
+from tcmrl_data.operations.assembly import check_folder, holds_part
 from tcmrl_data.operations.derive import derive_dataset
 from tcmrl_data.remote.address import parse_address
 from tcmrl_data.remote.files import counted
@@ -90,7 +89,7 @@ def pull_dataset(
         return _pull_whole(source, out, progress)
     selection = source.select(tasks=tasks, split=split, snapshots=snapshots, tier=tier)
     entries = [source.entry(key) for keys in selection.parts.values() for key in keys]
-    missing = [entry for entry in entries if not _is_whole(out, entry)]
+    missing = [entry for entry in entries if not holds_part(out / part_file(entry.key), entry)]
     source.fetch(selection, progress)
     made = derive_dataset(source, out, tasks=tasks, split=split, snapshots=snapshots, tier=tier)
     assert made.root is not None  # nothing is cut
@@ -108,7 +107,7 @@ def _pull_whole(source: Dataset, out: Path, progress: BytesProgress | None) -> P
         remove_abandoned(out)
         replace_file(out / ASSEMBLY, note, staging=out / STAGING)
         entries = [source.entry(key) for key in source.parts]
-        missing = [entry for entry in entries if not _is_whole(out, entry)]
+        missing = [entry for entry in entries if not holds_part(out / part_file(entry.key), entry)]
         total, lacking = (sum(entry.size for entry in group) for group in (entries, missing))
         say = counted(progress, total, total - lacking)
 
@@ -128,24 +127,9 @@ def _pull_whole(source: Dataset, out: Path, progress: BytesProgress | None) -> P
 
 def _check_out(out: Path, source: Dataset, note: bytes) -> None:
     """Refuses a folder that is neither new, nor that of this dataset, nor one where its pull was stopped."""
-    if not out.exists():
+    if not (out / MANIFEST).exists():
+        check_folder(out, note)
         return
-    if not out.is_dir():
-        raise StoreError(f"{out} is a file; choose another folder")
     check_work_files(out)
-    if (out / MANIFEST).exists():
-        if read_manifest(out).digest != source.manifest.digest:
-            raise StoreError(f"{out} holds another dataset than {source.path}; choose another folder")
-        return
-    begun = out / ASSEMBLY
-    if begun.exists() and read_plain_file(begun, limit=2**20) != note:
-        raise StoreError(f"{out} is being made into another dataset; choose another folder or remove it")
-    if not begun.exists() and {entry.name for entry in out.iterdir()} - {LOCK, STAGING}:
-        raise StoreError(f"{out} exists and is not empty; choose another folder or remove it")
-
-
-def _is_whole(out: Path, entry: PartEntry) -> bool:
-    try:
-        return sha256(read_plain_file(out / part_file(entry.key), limit=entry.size)) == entry.sha256
-    except (OSError, ValueError):
-        return False
+    if read_manifest(out).digest != source.manifest.digest:
+        raise StoreError(f"{out} holds another dataset than {source.path}; choose another folder")
