@@ -97,7 +97,7 @@ def _value(value: object) -> str:
     return text if len(text) <= 60 else f"{text[:57]}…"
 
 
-UNITS = {"reading": "parts", "playing": "episodes", "filming": "episodes", "drawing": "figures"}
+UNITS = {"reading": "parts", "playing": "episodes", "drawing": "figures"}
 NOTHING_KEPT = "nothing was written; run the same command again"
 
 
@@ -122,17 +122,8 @@ NOTHING_KEPT = "nothing was written; run the same command again"
     is_flag=True,
     help="Let every last policy play in every task, and say what a context is worth; takes longer.",
 )
-@click.option(
-    "--strips",
-    type=click.IntRange(0, 20),
-    default=0,
-    show_default=True,
-    help="Number of episodes to simulate again and draw; MuJoCo needs OpenGL.",
-)
 @output_options
-def dataset_report(
-    dataset: Path, out: Path | None, episodes: int, transfer: bool, strips: int, as_json: bool
-) -> None:
+def dataset_report(dataset: Path, out: Path | None, episodes: int, transfer: bool, as_json: bool) -> None:
     """Write a page that shows what is in DATASET.
 
     The page is one HTML file that needs no network: verdicts, learning curves, returns, states that the tasks
@@ -143,7 +134,7 @@ def dataset_report(
     Examples:
       tcmrl-data report data/point-robot
       tcmrl-data report data/point-robot --out report.html --episodes 40
-      tcmrl-data report data/point-robot --transfer --strips 3
+      tcmrl-data report data/point-robot --transfer
     """
     import tcmrl_data
 
@@ -155,7 +146,6 @@ def dataset_report(
             target,
             episodes=episodes,
             transfer=transfer,
-            strips=strips,
             progress=lambda stage, done, total: progress.update(
                 stage, done=done, total=total, unit=UNITS[stage]
             ),

@@ -88,7 +88,6 @@ MEANINGS = {
     "--steps": "training steps of every run, to which schedules are scaled",
     "--stop-at": "the training step to stop at; schedules stay",
     "--strict": "what else is a note is an error",
-    "--strips": "a number of episodes to draw",
     "--tag": "a name for a state of a dataset",
     "--task": "the index of a task",
     "--task-file": "a file that describes tasks",

@@ -19,9 +19,7 @@ from tcmrl_data import Dataset
 from tcmrl_data.dataset.listing import list_episodes
 from tcmrl_data.describe import measures
 from tcmrl_data.describe.measures import ACTION_BINS, SATURATED, Content, choose_plane, measure
-from tcmrl_data.describe.render import Strips, film_strips
 from tcmrl_data.describe.report import report_html
-from tcmrl_data.foundation.errors import RenderingError
 from tcmrl_data.foundation.page import cell_text
 from tcmrl_data.quality.worth import context_worth
 from tcmrl_data.store.tables import PartKey
@@ -273,22 +271,11 @@ def test_a_damaged_part_and_an_empty_dataset_are_refused(
 
 
 @pytest.mark.check
-def test_policies_in_other_tasks_and_pictures_are_shown_if_asked_for(tiny: Dataset, page: str) -> None:
-    found = measure(tiny, browsed=1, transfer=True, strips=2)
+def test_policies_in_other_tasks_are_shown_if_asked_for(tiny: Dataset, page: str) -> None:
+    found = measure(tiny, browsed=1, transfer=True)
     assert found.transfer == tcmrl_data.measure_transfer(tiny)
-    assert found.strips is not None
-    assert [strip.content[:4] for strip in found.strips.drawn] == [b"\x89PNG"] * 2
     text = report_html(found)
-    assert 'id="cross-task-returns"' in text and text.count("Played again from its seed") == 4  # alt, caption
+    assert 'id="cross-task-returns"' in text
     _, splits = context_worth(found.transfer)
     assert f"A context is worth {'only ' if splits[-1].worth < 0.1 else ''}{splits[-1].worth:.0%}" in text
-    assert 'id="cross-task-returns"' not in page and "Played again" not in page
-
-
-def test_an_environment_without_a_picture_is_said(tiny: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(*args: Any, **keywords: Any) -> None:
-        raise RenderingError("it has no picture")
-
-    monkeypatch.setattr("tcmrl_data.describe.render.render_episode", refuse)
-    found = film_strips(tiny, tiny.tasks)
-    assert found == Strips((), "it has no picture")
+    assert 'id="cross-task-returns"' not in page

@@ -9,7 +9,6 @@ import numpy.typing as npt
 
 from tcmrl_data.dataset.dataset import Dataset
 from tcmrl_data.dataset.listing import dataset_summary, list_returns, list_tasks
-from tcmrl_data.describe.render import Strips, film_strips
 from tcmrl_data.envs.base import Task
 from tcmrl_data.envs.rollout import FloatArray, Trajectory
 from tcmrl_data.foundation.errors import SelectionError, TcmrlError
@@ -59,7 +58,7 @@ class Content:
         shown: tasks that are drawn one by one.
         endings: of the episodes of all parts, with their returns.
         paths: of the first, the middle and the last snapshot of the shown tasks.
-        transfer: None unless it was asked for; as `strips`.
+        transfer: None unless it was asked for.
     """
 
     dataset: Dataset
@@ -77,7 +76,6 @@ class Content:
     paths: "Paths"
     browsed: list["Browsed"]
     transfer: Transfer | None
-    strips: Strips | None
 
 
 def measure(
@@ -85,7 +83,6 @@ def measure(
     *,
     browsed: int,
     transfer: bool = False,
-    strips: int = 0,
     progress: StageProgress | None = None,
 ) -> Content:
     """Reads a dataset part by part.
@@ -94,7 +91,6 @@ def measure(
         dataset: the dataset; of an incomplete one, what is there.
         browsed: number of whole episodes to keep, of different parts.
         transfer: let every last policy play in every task.
-        strips: number of episodes to simulate again for pictures.
         progress: called with the stage, the amount done and the total; every part is read three times.
 
     Raises:
@@ -145,9 +141,6 @@ def measure(
         paths,
         whole,
         measure_transfer(dataset, progress=progress_of("playing")) if transfer else None,
-        film_strips(dataset, evenly_spread(shown, strips), progress=progress_of("filming"))
-        if strips
-        else None,
     )
 
 

@@ -14,10 +14,9 @@ import numpy as np
 
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.describe.film import Frame, StoredEpisode, film, find_episode
-from tcmrl_data.envs.base import Picture, Task, place_in_order
+from tcmrl_data.envs.base import Picture, place_in_order
 from tcmrl_data.foundation.disk import replace_file
 from tcmrl_data.foundation.errors import RenderingError, SelectionError, SimulationError
-from tcmrl_data.quality.transfer import last_part
 from tcmrl_data.store.part import this_platform
 from tcmrl_data.store.tables import MAIN_RUN, PartKey
 
@@ -41,8 +40,6 @@ MAX_FRAMES = 500
 GAP = 4
 """Between stills, in pixels."""
 SMALLEST_WIDTH, DEFAULT_WIDTH, LARGEST_WIDTH = 64, 320, 640
-STRIP_WIDTH = 240
-"""Width of a still in a report, in pixels."""
 
 BAR, LEAST_BAR = 0.056, 14
 """Height of a line of words as a share of the width of a frame, and its least in pixels."""
@@ -130,47 +127,6 @@ def render_episode(
         frames=len(taken),
         bytes=len(content),
     )
-
-
-@dataclass(frozen=True)
-class Strip:
-    """One episode in stills, as the bytes of a PNG file."""
-
-    caption: str
-    content: bytes
-
-
-@dataclass(frozen=True)
-class Strips:
-    """The strips that could be drawn, and why there are not more, where one could not be drawn."""
-
-    drawn: tuple[Strip, ...]
-    reason: str | None = None
-
-
-def film_strips(
-    dataset: Dataset, tasks: Sequence[Task], *, progress: Callable[[int, int], None] | None = None
-) -> Strips:
-    """Draws the first episode of the last snapshot of some tasks, until one cannot be drawn."""
-    drawn: list[Strip] = []
-    with tempfile.TemporaryDirectory() as folder:
-        for task in tasks:
-            key = last_part(dataset, task)
-            file = Path(folder) / f"{task.index}.png"
-            try:
-                found = render_episode(
-                    dataset, file, task=key.task, step=key.step, run=key.run, width=STRIP_WIDTH
-                )
-            except (RenderingError, SimulationError) as error:
-                return Strips(tuple(drawn), str(error))
-            caption = (
-                f"Task {task.index} ({task.split}), step {found.step:,}, first episode: {found.steps:,} "
-                f"steps, return {found.reward:.4g}. Played again from its seed, with equal observations."
-            )
-            drawn.append(Strip(caption, file.read_bytes()))
-            if progress is not None:
-                progress(len(drawn), len(tasks))
-    return Strips(tuple(drawn))
 
 
 def _check_sizes(frames: int | None, width: int) -> None:

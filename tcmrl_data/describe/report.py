@@ -44,7 +44,6 @@ def report_dataset(
     *,
     episodes: int = EPISODES,
     transfer: bool = False,
-    strips: int = 0,
     progress: StageProgress | None = None,
 ) -> Path:
     """Writes the report on a dataset and returns its file.
@@ -56,7 +55,6 @@ def report_dataset(
         out: the HTML file, which is replaced if it exists.
         episodes: number of whole episodes to browse.
         transfer: let every last policy play in every task, and say what a context is worth; takes longer.
-        strips: number of episodes to draw, by simulating them again; as many as can be drawn.
         progress: called with the stage, the amount done and the total.
 
     Raises:
@@ -69,7 +67,7 @@ def report_dataset(
         >>> report_dataset(open_dataset("data/point-robot"), "report.html")  # doctest: +SKIP
     """
     _plotly_script()
-    content = measure(dataset, browsed=episodes, transfer=transfer, strips=strips, progress=progress)
+    content = measure(dataset, browsed=episodes, transfer=transfer, progress=progress)
     out = Path(out)
     make_folders(out.parent)
     replace_file(out, report_html(content, progress).encode())

@@ -42,7 +42,7 @@ def render_page(
         lstrip_blocks=True,
         finalize=_finalized,
     )
-    environment.filters |= {"cell": cell_text, "data_url": _data_url}
+    environment.filters["cell"] = cell_text
     return environment.get_template(template).render(
         values,
         title=title,
@@ -64,11 +64,6 @@ def cell_text(cell: Any) -> str:
     if isinstance(cell, float):
         return f"{cell:,.0f}" if abs(cell) >= 10_000 else f"{cell:.4g}"
     return cell if isinstance(cell, str) else str(cell)
-
-
-def _data_url(content: bytes) -> str:
-    """A PNG file as an address that needs no network."""
-    return f"data:image/png;base64,{base64.b64encode(content).decode('ascii')}"
 
 
 def allowed_text(text: str) -> str:
