@@ -8,7 +8,8 @@ import click
 from tcmrl_data.foundation.files import printable
 from tcmrl_data.foundation.machine import size
 
-from .frame import QUIET_OPTION, output_options, print_json, remark
+from .frame import QUIET_OPTION, output_options, print_json, remark, stopped_by_signals
+from .looking import NOTHING_KEPT
 from .options import (
     DATASET,
     DRY_RUN,
@@ -22,7 +23,7 @@ from .options import (
     beside,
     indices,
 )
-from .progress import PartsProgress, with_progress
+from .progress import PartsProgress, StageProgress, with_progress
 
 if TYPE_CHECKING:
     from tcmrl_data.envs.base import Split
@@ -64,13 +65,11 @@ def export(
       MINARI_DATASETS_PATH=minari minari list local
     """
     import tcmrl_data
-    from tcmrl_data.interchange.exporting import staging_folder
 
     opened = tcmrl_data.open_dataset(dataset)
     target = out or beside(opened.path, f"-{format_name}")
-
-    def work(progress: PartsProgress) -> tcmrl_data.ExportReport:
-        return tcmrl_data.export_dataset(
+    with stopped_by_signals(lambda: NOTHING_KEPT), StageProgress() as progress:
+        report = tcmrl_data.export_dataset(
             opened,
             format_name,
             target,
@@ -79,10 +78,8 @@ def export(
             tier=tier,
             snapshots=snapshots,
             dry_run=dry_run,
-            progress=progress,
+            progress=lambda done, total: progress.update("export", done=done, total=total, unit="parts"),
         )
-
-    report = with_progress(work, stage="export", out=staging_folder(target))
     num_bytes = sum(file.stat().st_size for file in report.files)
     if as_json:
         print_json(

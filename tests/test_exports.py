@@ -1,4 +1,4 @@
-"""Exports: what goes out comes back, other programs' rules find it, and a stopped export goes on."""
+"""Exports: what goes out comes back, other programs' rules find it."""
 
 import json
 import pickletools
@@ -15,7 +15,6 @@ import pytest
 from tcmrl_data import FORMATS, Dataset, Trajectory, export_dataset, import_dataset, open_dataset
 from tcmrl_data.foundation.disk import lock_file
 from tcmrl_data.foundation.errors import LockedError, SelectionError, StoreError, TaskError
-from tcmrl_data.interchange.exporting import LOCK, staging_folder
 from tests.conftest import TASKS
 from tests.test_adapters import terminated_early
 from tests.test_interchange import assert_equal
@@ -246,75 +245,20 @@ def test_one_part_at_a_time_is_in_memory(
     assert most <= 2  # the one before, until the next is bound to its name
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_an_interrupted_export_goes_on_behind_its_last_finished_task(
-    name: str, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_an_export_removes_what_a_killed_one_left_and_excludes_a_running_one(
+    tiny: Dataset, tmp_path: Path
 ) -> None:
-    straight = exported(tiny, name, tmp_path / "straight", snapshots="last")
-    read: list[int] = []
-    original = Dataset.trajectories
-
-    def stopping(self: Dataset, task: int, step: int, run: str = "main") -> list[Trajectory]:
-        if task == 40 and 40 not in read:
-            read.append(task)
-            raise KeyboardInterrupt
-        read.append(task)
-        return original(self, task, step, run)
-
-    monkeypatch.setattr(Dataset, "trajectories", stopping)
-    with pytest.raises(KeyboardInterrupt):
-        export_dataset(tiny, name, tmp_path / "out", snapshots="last")
-    assert not (tmp_path / "out").exists()
-    seen: list[tuple[int, int]] = []
-    files = export_dataset(
-        tiny, name, tmp_path / "out", snapshots="last", progress=lambda *counts: seen.append(counts)
-    ).files
-    assert read == [0, 3, 40, 40, 60, 99]
-    assert seen == [(done, 5) for done in range(1, 6)]
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "straight"]
-    relative = [file.relative_to(tmp_path / "out") for file in files]
-    assert relative == [file.relative_to(tmp_path / "straight") for file in straight]
-    for file, other in zip(files, straight, strict=True):
-        assert file.read_bytes() == other.read_bytes() or name == "minari"  # whose records name the time
-
-
-def interrupted(tiny: Dataset, out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = Dataset.trajectories
-
-    def stopping(self: Dataset, task: int, step: int, run: str = "main") -> list[Trajectory]:
-        if task == 40:
-            raise KeyboardInterrupt
-        return original(self, task, step, run)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Dataset, "trajectories", stopping)
-        with pytest.raises(KeyboardInterrupt):
-            export_dataset(tiny, "hdf5", out, snapshots="last")
-
-
-def test_another_export_to_the_same_place_begins_anew(
-    tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    interrupted(tiny, tmp_path / "out", monkeypatch)
-    files = export_dataset(tiny, "hdf5", tmp_path / "out", snapshots="steps>=100", tasks=[3]).files
-    assert [file.name for file in files] == ["task_00003.hdf5"]
-    with h5py.File(files[0]) as file:
-        assert file.attrs["snapshots"].tolist() == [100, 150]
-    assert [path.name for path in tmp_path.iterdir()] == ["out"]
-
-
-def test_two_exports_to_one_place_exclude_each_other(
-    tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    interrupted(tiny, tmp_path / "out", monkeypatch)
-    staged = staging_folder(tmp_path / "out")
-    before = sorted(staged.rglob("*"))
+    staged = tmp_path / ".out.partial"
+    (staged / "files").mkdir(parents=True)
+    (staged / "files/task_00000.hdf5").touch()
     with (
-        lock_file(staged / LOCK, "the export"),
+        lock_file(staged / "lock", "the export"),
         pytest.raises(LockedError, match=r"the export .*out is being written by process"),
     ):
         export_dataset(tiny, "hdf5", tmp_path / "out", snapshots="last")
-    assert sorted(staged.rglob("*")) == before
+    files = export_dataset(tiny, "hdf5", tmp_path / "out", snapshots="last", tasks=[3]).files
+    assert [file.name for file in files] == ["task_00003.hdf5"]
+    assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
 
 @pytest.mark.parametrize("is_link", [False, True])
@@ -324,7 +268,7 @@ def test_what_lies_where_exports_are_staged_is_left_alone(
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "notes").touch()
-    staged = staging_folder(tmp_path / "out")
+    staged = tmp_path / ".out.partial"
     if is_link:
         staged.symlink_to(mine)
     else:

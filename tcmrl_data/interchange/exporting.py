@@ -1,6 +1,6 @@
 """Export: a selection of a dataset in the format of another library, and the base class of formats.
 
-A format is a plug-in that writes one task. Staging, syncing, resuming and publishing of the folder are here.
+A format is a plug-in that writes one task. Staging, syncing and publishing of the folder are here.
 """
 
 import abc
@@ -9,7 +9,6 @@ import importlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -21,21 +20,16 @@ from tcmrl_data.dataset.selection import Selection
 from tcmrl_data.envs.base import Split, Task
 from tcmrl_data.envs.rollout import Trajectory
 from tcmrl_data.foundation.disk import (
-    disk,
     lock_file,
-    make_folders,
     move_into_place,
     named_errors,
     remove_tree,
     replace_file,
     require_room,
     sync_files,
-    write_file,
 )
 from tcmrl_data.foundation.errors import MissingPackageError, StorageError, StoreError
-from tcmrl_data.foundation.files import read_plain_file
 from tcmrl_data.foundation.plugins import Registry
-from tcmrl_data.foundation.records import canonical_json
 from tcmrl_data.interchange.reader import EPISODE_ARRAYS, FORMAT_VERSION
 from tcmrl_data.recipe.document import AND
 from tcmrl_data.store.tables import PartKey
@@ -50,16 +44,16 @@ COPIES = 4
 EPISODE_BYTES = 2**12
 """Room for the records that HDF5 keeps of an episode's arrays; robomimic's take 3 kB."""
 
-CLAIM, LOCK, FINISHED, OPEN = "export", "lock", "finished", "open"
-"""In the staging folder: what is exported, the lock, finished tasks, and the task that is being written."""
+LOCK, FILES = "lock", "files"
+"""In the staging folder."""
 
 
 class Format(abc.ABC):
     """Writes datasets task by task; a plug-in of the group `tcmrl.formats`, made without arguments.
 
     `export_dataset` calls the methods. It stages, syncs and publishes what they write, so that an export
-    appears whole or not at all, and a stopped one goes on behind its last finished task. Optional libraries
-    are imported inside methods, so that other formats work without them.
+    appears whole or not at all. Optional libraries are imported inside methods, so that other formats work
+    without them.
     """
 
     name: ClassVar[str]
@@ -203,8 +197,7 @@ def export_dataset(
 ) -> ExportReport:
     """Writes a selection of a dataset into a new folder, one part in memory at a time.
 
-    The folder appears under its name when all files are complete, and not at all when something fails. After
-    an interruption or a crash, the same call goes on behind the last finished task.
+    The folder appears under its name when all files are complete, and not at all when something fails.
 
     Args:
         dataset: a complete dataset, or its path.
@@ -274,11 +267,6 @@ def require_packages(what: str, packages: Sequence[str], extra: str | None) -> N
         ) from None
 
 
-def staging_folder(out: Path) -> Path:
-    """Where the export to `out` is made, and kept when it is interrupted."""
-    return out.with_name(f".{out.name}.partial")
-
-
 def _require_free(out: Path) -> None:
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise StoreError(f"--out {out} exists and is not empty; choose another folder or remove it")
@@ -287,42 +275,31 @@ def _require_free(out: Path) -> None:
 def _write(
     exporter: Format, selection: Selection, out: Path, progress: Callable[[int, int], None] | None
 ) -> None:
-    """Writes the tasks that no earlier attempt has finished."""
     total, done = sum(map(len, selection.parts.values())), 0
-    # what the files follow from; the manifest seals the tasks and the parts
-    chosen = [selection.rule, [task.index for task in selection.tasks], [*selection.parts.values()]]
-    made_by = [exporter.name, version("tcmrl"), selection.dataset.manifest.digest]
-    with _staged(out, canonical_json([*made_by, *chosen])) as staged:
+    with _staged(out) as folder:
         for task in selection.tasks:
-            name = exporter.place(selection, task)
-            if (staged / FINISHED / name).exists():
-                done += len(selection.parts[task.index])
+            path = folder / exporter.place(selection, task)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            require_room(path, FILE_BYTES, remedy=REMEDY)
+            for _ in exporter.write(selection, task, path):
+                done += 1
                 if progress is not None:
                     progress(done, total)
-                continue
-            with _adding(staged, name) as path:
-                require_room(path, FILE_BYTES, remedy=REMEDY)
-                for _ in exporter.write(selection, task, path):
-                    done += 1
-                    if progress is not None:
-                        progress(done, total)
         for name, content in exporter.accompanying(selection).items():
-            replace_file(staged / FINISHED / name, content, staging=staged / OPEN)
+            replace_file(folder / name, content)
 
 
 @contextlib.contextmanager
-def _staged(out: Path, claim: bytes) -> Iterator[Path]:
-    """Gives the staging folder, whose finished files are moved to `out` at the end.
-
-    After an error nothing is left. After an interruption or a crash, what was finished is kept for the next
-    attempt with the same claim.
+def _staged(out: Path) -> Iterator[Path]:
+    """Gives an empty folder, which is forced to disk and renamed to `out` at the end, or removed.
 
     Raises:
-        StoreError: `out` exists and is not empty, or something else lies where the export is staged.
+        StoreError: something else lies where the export is staged, or `out` has appeared meanwhile.
         LockedError: another process exports to `out`.
         StorageError: the disk refuses.
     """
-    staged = staging_folder(out)
+    staged = out.with_name(f".{out.name}.partial")
+    folder = staged / FILES
     try:
         with named_errors(out, remedy=REMEDY):
             out.parent.mkdir(parents=True, exist_ok=True)
@@ -332,48 +309,15 @@ def _staged(out: Path, claim: bytes) -> Iterator[Path]:
             staged.mkdir(exist_ok=True)
             with lock_file(staged / LOCK, f"the export {out}"):
                 try:
-                    _take_up(staged, claim)
-                    yield staged
-                    if not move_into_place(staged / FINISHED, out):
+                    remove_tree(folder)  # what a killed export left
+                    folder.mkdir()
+                    yield folder
+                    sync_files(folder, filter(Path.is_file, folder.rglob("*")))
+                    if not move_into_place(folder, out):
                         raise StoreError(
                             f"--out {out} appeared meanwhile; choose another folder or remove it"
                         )
-                except Exception:
+                finally:
                     remove_tree(staged)
-                    raise
-                remove_tree(staged)
     except StorageError as error:
-        text = str(error)
-        for inner in (staged / OPEN, staged / FINISHED, staged):
-            text = text.replace(str(inner), str(out))
-        raise StorageError(text) from None
-
-
-def _take_up(staged: Path, claim: bytes) -> None:
-    """Keeps what an attempt with the same claim has finished, and nothing of any other."""
-    file = staged / CLAIM
-    try:
-        if read_plain_file(file, limit=len(claim)) == claim:
-            return
-    except (OSError, ValueError):
-        pass  # none, or of another export
-    file.unlink(missing_ok=True)
-    for folder in (staged / FINISHED, staged / OPEN):
-        remove_tree(folder)
-    make_folders(staged / FINISHED)
-    write_file(file, claim)
-    disk.sync(staged)
-
-
-@contextlib.contextmanager
-def _adding(staged: Path, name: str) -> Iterator[Path]:
-    """Gives the path at which to write a task; it is forced to disk and counts as finished at the end."""
-    folder = staged / OPEN
-    remove_tree(folder)
-    path, target = folder / name, staged / FINISHED / name
-    path.parent.mkdir(parents=True)
-    yield path
-    sync_files(folder, [path] if path.is_file() else filter(Path.is_file, path.rglob("*")))
-    make_folders(target.parent)
-    disk.rename(path, target)
-    disk.sync(target.parent)
+        raise StorageError(str(error).replace(str(folder), str(out)).replace(str(staged), str(out))) from None
