@@ -19,6 +19,7 @@ from tests.workers import ROOT
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
 Copy = Callable[[], Path]
+BUILD = ("build", "point-robot", "--profile", "quick")
 SETTINGS = [argument for text in TINY for argument in ("--set", text)]
 
 
@@ -141,28 +142,19 @@ def test_export_takes_a_selection_and_only_says_what_it_would_write(
     assert_refused(call(*arguments, "--tasks", "1"), "no task 1")
 
 
-BUILD = ("build", "point-robot", "--profile", "quick")
-
-
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
         (("build", "point-robt"), ["point-robt", "point-robot", "sparse-point-robot"]),
-        (("build", "ml1/reech", "--plan"), ["ml1/reech", "ml1/reach"]),
-        ((*BUILD, "--set", "rollouts.episods=3"), ["episods"]),
         ((*BUILD, "--set", "rolouts.episodes=3"), ["rolouts", "rollouts"]),
         ((*BUILD, "--set", "rollouts.episodes=many"), ["rollouts", "episodes", "integer", "many"]),
         ((*BUILD, "--set", "rollouts.episodes"), ["rollouts.episodes", "section.key=value"]),
         ((*BUILD, "--tasks", "0-100"), ["100", "0-99"]),
         ((*BUILD, "--tasks", "1,x"), ["'x'", "0-9"]),
-        ((*BUILD, "--behavior", "sacc"), ["sacc", "sac"]),
-        ((*BUILD, "--engine", "locale"), ["locale", "local"]),
         ((*BUILD, "--profile", "tiny"), ["tiny", "quick", "build --help"]),
         ((*BUILD, "--workers", "0"), ["--workers", "0"]),
         ((*BUILD, "--nothing"), ["--nothing", "build --help"]),
-        (("buid",), ["buid"]),
         (("build",), ["ENV", "build --help"]),
-        (("export", "nowhere", "--format", "hdf6"), ["hdf6", "hdf5"]),
         (("inspect", "returns", "nowhere"), ["nowhere/manifest.json", "tcmrl-data build"]),
     ],
 )
@@ -269,17 +261,7 @@ def test_recipe_prints_the_values_of_a_recipe_as_json(call: Call, tmp_path: Path
 def test_a_command_without_an_output_ends_in_silence(tiny_folder: Path) -> None:
     """As `tcmrl-data show d >&-` in a shell, which leaves the number of the stream to the next open file."""
     code = "from tcmrl_cli.data import main; main()"
-    shell = [
-        "sh",
-        "-c",
-        'exec "$@" >&-',
-        "sh",
-        sys.executable,
-        "-c",
-        code,
-        "show",
-        str(tiny_folder),
-        "--quiet",
-    ]
+    command = [sys.executable, "-c", code, "show", str(tiny_folder), "--quiet"]
+    shell = ["sh", "-c", 'exec "$@" >&-', "sh", *command]
     result = subprocess.run(shell, cwd=ROOT, stderr=subprocess.PIPE, text=True, check=False)
     assert (result.returncode, result.stderr) == (0, "")

@@ -191,17 +191,8 @@ def test_a_build_says_whether_its_root_is_the_published_one(
     assert "it lacks 9 parts, first task 40" in str(why_not_published(tmp_path / "less", tiny))
     call = in_process(data, capsys)
     settings = [word for value in TINY for word in ("--set", value)]
-    build = (
-        "build",
-        "point-robot",
-        "--profile",
-        "quick",
-        *settings,
-        "--tasks",
-        "0",
-        "--out",
-        tmp_path / "built",
-    )
+    build = ("build", "point-robot", "--profile", "quick", *settings, "--tasks", "0")
+    build += ("--out", tmp_path / "built")
     code, _, errors = call(*build, "--expect-root", tiny.folder)
     assert code == 1 and "it lacks 12 parts, first task 3" in errors
     built = open_dataset(tmp_path / "built").manifest.root
