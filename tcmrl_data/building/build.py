@@ -48,8 +48,6 @@ class BuildReport:
 
     Attributes:
         present: parts that were there, with the recorded sizes.
-        failed: one line per unit that failed.
-        root: Merkle root of the dataset as it now stands.
         read_only: the folder cannot be written, and nothing had to be.
     """
 
@@ -85,10 +83,8 @@ def build_dataset(
             build that names them in `tasks` takes them up again.
         workers: units run at the same time; as many as the engine has cores where None.
         engine: an engine's name, or an engine, which has its own workers and address.
-        address: of the engine's cluster, where it has one.
         checkpoint_seconds: least time between two checkpoints of behavior training, which a build that was
             stopped continues from. Writing them takes 5 % of the time at most; 0 is as often as possible.
-        progress: called as the build goes on.
 
     Raises:
         BuildError: a seed outside [0, 2**63), `out` is no dataset, or one of other settings or another seed.
@@ -187,7 +183,6 @@ class Driver:
 
     Args:
         ledger: of the dataset; the driver is its only writer.
-        dataset: the dataset's folder, as workers find it.
         checkpoint_seconds: least time between two checkpoints of behavior training.
     """
 

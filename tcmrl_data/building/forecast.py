@@ -31,8 +31,6 @@ class Forecast:
         bytes: size of the arrays before compression, an upper bound.
         unit_bytes: most memory that a worker takes.
         seconds: expected wall time with `workers` processes on this machine.
-        seconds_low: the short end of its spread.
-        seconds_high: the long end.
     """
 
     environment: str
@@ -102,7 +100,6 @@ class Measurement:
         warmup: per environment step of the warm-up.
         updates: per environment step with its updates, in the first and the second half of the probe.
         first_part: of a task's first part, with its reference returns.
-        part: of every further part.
         stretch: how many times longer rollouts are where no episode ends early.
     """
 

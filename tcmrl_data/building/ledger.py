@@ -62,7 +62,6 @@ class Ledger:
     Attributes:
         plan: with the tasks of the dataset.
         num_parts: parts that are there, of those that the plan calls for.
-        num_tasks_done: tasks of which no part is missing.
         damaged: files of parts that nothing had recorded when they were damaged; `begin` deletes them.
 
     Raises:

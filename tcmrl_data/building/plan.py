@@ -47,7 +47,6 @@ class BuildPlan:
     """What a build, its driver and its workers share.
 
     Attributes:
-        seed: root seed of behavior training and rollouts.
         tasks: the tasks to build, ascending by index.
         dropped: indices of tasks that are trained with their group, whose rounding would change without them,
             but of which no parts are made.
@@ -141,7 +140,6 @@ def plan_build(
     """The plan of a build.
 
     Args:
-        seed: root seed of behavior training and rollouts.
         tasks: indices of the full task set instead of the profile's choice.
         dropped: indices of tasks of which no parts are made.
 

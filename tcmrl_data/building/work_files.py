@@ -126,7 +126,6 @@ class _Status(Record):
     Attributes:
         time: Unix time of the latest event.
         running: ids of the units at work, in the order of their first events.
-        failed: messages of the latest failed units.
         steps_per_second: environment steps of behavior training, over the latest minute; None if none.
     """
 
@@ -209,7 +208,6 @@ class BuildStatus:
     Attributes:
         builder: the process that builds it now; null where none does.
         failed: one line per unit that failed in the latest build, the latest 100.
-        num_failed: units that failed in the latest build.
         steps_per_second: environment steps of behavior training, over the latest minute.
         seconds_left: at that rate; null where nothing is known.
         updated: Unix time of the latest event.

@@ -35,7 +35,6 @@ class Citation:
 
     Attributes:
         version: the first twelve digits of the dataset's root: equal data, equal version.
-        licences: all that the data are under.
     """
 
     name: str

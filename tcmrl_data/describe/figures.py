@@ -404,7 +404,6 @@ def _heat_map(
     """Cells, the first row at the bottom; NaN is blank.
 
     Args:
-        z: (rows, columns).
         x: borders of what the columns divide; their centers are at 0, 1, … where None.
     """
     places: dict[str, float] = {}

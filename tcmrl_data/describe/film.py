@@ -83,9 +83,7 @@ def film(
     """Plays an episode again and takes pictures, evenly spread from its start to its end.
 
     Args:
-        frames: most pictures.
         width: of the pictures in pixels; their height is three quarters of it.
-        progress: called with steps done and steps in all.
 
     Raises:
         RenderingError: the environment has no camera, or this machine cannot draw it.

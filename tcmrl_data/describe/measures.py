@@ -55,10 +55,8 @@ class Content:
     Attributes:
         returns: the document of `inspect returns --json`.
         tasks: the document of `inspect tasks --json`.
-        shown: tasks that are drawn one by one.
         endings: of the episodes of all parts, with their returns.
         paths: of the first, the middle and the last snapshot of the shown tasks.
-        transfer: None unless it was asked for.
     """
 
     dataset: Dataset
@@ -90,7 +88,6 @@ def measure(
     Args:
         dataset: the dataset; of an incomplete one, what is there.
         browsed: number of whole episodes to keep, of different parts.
-        transfer: let every last policy play in every task.
         progress: called with the stage, the amount done and the total; every part is read three times.
 
     Raises:
@@ -343,7 +340,6 @@ class Browsed:
     """An episode to browse.
 
     Attributes:
-        number: its place in the part.
         ended: how it ended: terminated, truncated, or cut where neither is stored.
         steps: (rows,) of the drawn steps.
         rewards: (rows,).

@@ -22,7 +22,6 @@ def push_dataset(
     """Copies a dataset to an address. The same call, made again after an interruption, goes on.
 
     Args:
-        dataset: its folder.
         url: of a folder in a bucket, such as `s3://bucket/point-robot`, or of a dataset of the Hub, such as
             `hf://datasets/owner/name`, which also gets a card and Parquet for the Hub's viewer.
         tag: a name for this state of the dataset; it is opened as `url@tag`. Without a tag the address itself

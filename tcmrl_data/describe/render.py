@@ -81,10 +81,8 @@ def render_episode(
     Args:
         out: file to write: `.webp` or `.mp4` for a film, `.png` for a strip of stills.
         step: snapshot step; the task's last one where None.
-        episode: position in the part.
         frames: most pictures, evenly spread over the episode; 100 of a film and 5 of a strip where None.
         width: of a picture in pixels; its height is three quarters of it.
-        progress: called with steps done and steps in all.
 
     Raises:
         SelectionError: the dataset has no such task, snapshot or episode.

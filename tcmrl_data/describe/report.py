@@ -52,8 +52,6 @@ def report_dataset(
 
     Args:
         dataset: the dataset; of an incomplete one, what is there.
-        out: the HTML file, which is replaced if it exists.
-        episodes: number of whole episodes to browse.
         transfer: let every last policy play in every task, and say what a context is worth; takes longer.
         progress: called with the stage, the amount done and the total.
 

@@ -20,8 +20,6 @@ class Unit:
     """Work for one process. A unit may run more than once.
 
     Attributes:
-        id: name of the unit in messages and logs.
-        spec: JSON values that the worker reads.
         worker: module whose `work` the process calls, see `tcmrl_data.engine.local`.
         threads: threads of the process's numerical libraries.
         cost: relative duration; the longest unit starts first.
@@ -47,7 +45,6 @@ class Result:
     """How a unit ended.
 
     Attributes:
-        ok: True if the unit is done.
         digest: digest of the work done, if `ok`; equal work has equal digests.
         error: one line, if not `ok`.
         attempt: number of attempts, at least 1.

@@ -82,9 +82,7 @@ class Outcome:
     """How an attempt ended; exactly one of the three attributes is set.
 
     Attributes:
-        digest: the unit's digest, if the unit is done.
         error: the error that the worker reported; the unit is not tried again.
-        crash: how the worker ended, if it reported no result.
     """
 
     digest: str | None = None

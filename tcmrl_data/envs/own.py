@@ -180,7 +180,6 @@ def new_environment(name: str, out: Path) -> list[Path]:
 
     Args:
         name: of the environment, such as `mountain-car`.
-        out: a folder that does not exist yet.
 
     Returns:
         The files written, in the order in which they are read.

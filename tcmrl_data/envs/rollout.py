@@ -172,12 +172,7 @@ class _Wrapper(Controller):
 
 @final
 class NoisyController(_Wrapper):
-    """Adds normal noise to another controller's actions, for one rollout, which clips the sum to [-1, 1].
-
-    Args:
-        controller: the controller; its own noise does not change.
-        generators: generators of the added noise, one per lane.
-    """
+    """Adds normal noise to another controller's actions, for one rollout, which clips the sum to [-1, 1]."""
 
     def __init__(
         self, controller: Controller, sigma: float, generators: Iterable[np.random.Generator]
@@ -249,8 +244,6 @@ def roll_out(
     Args:
         environment: gives the horizon, the action size and the stored view.
         lanes: L lanes, which may be used for several rollouts.
-        controller: acts for all lanes and observes every step.
-        reset_seeds: one per lane.
         noise: one generator per lane; the noise of a whole episode is drawn before it starts.
 
     Returns:

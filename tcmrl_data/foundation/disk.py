@@ -107,7 +107,6 @@ def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> Non
     A link in its place is replaced, not followed, and another name of the old file keeps the old content.
 
     Args:
-        path: the file; missing parent folders are created.
         staging: folder for the unfinished file; None, or a folder on another disk than the file's, writes a
             hidden file next to `path`.
     """
@@ -159,7 +158,6 @@ def place_file(path: Path, data: bytes, *, staging: Path) -> None:
     goes on after a crash must check its content.
 
     Args:
-        path: the file; missing parent folders are created.
         staging: folder for the unfinished file; it exists.
     """
     temporary = staging / f"{path.name}.{uuid.uuid4().hex}"

@@ -82,10 +82,6 @@ def open_plain_file(file: Path, *, limit: int) -> BinaryIO:
 def folder_problem(root: Path, folder: str) -> tuple[str, str] | None:
     """Finds the first component of a relative path that is neither a folder nor leads to one.
 
-    Args:
-        root: the folder that the path begins in.
-        folder: path relative to `root`.
-
     Returns:
         The component's path relative to `root` and the reason, or None if all components are folders.
     """
@@ -131,9 +127,6 @@ _FLOCK = "hhqqi4x"  # struct flock of 64-bit Linux
 def try_exclusive_lock(file: IO[Any]) -> bool:
     """Takes the exclusive lock on a file; closing the file releases it.
 
-    Args:
-        file: open for writing.
-
     Returns:
         False, at once, if another open file holds the lock.
 
@@ -161,9 +154,6 @@ def take_shared_lock(file: IO[Any]) -> None:
 
 def is_locked(file: IO[Any]) -> bool:
     """True if another open file holds the lock, exclusive or shared; asking never disturbs a writer.
-
-    Args:
-        file: may be open for reading only.
 
     Returns:
         False where the file system has no locks, since nobody can hold one there.

@@ -25,7 +25,6 @@ def render_page(
 
     Args:
         template: name of a template that extends `page.html.jinja`; it may import `blocks.html.jinja`.
-        scripts: JavaScript that runs at the end of the page.
     """
     sections: dict[str, str] = {}
 

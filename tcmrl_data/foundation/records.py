@@ -171,9 +171,6 @@ def record_bytes(record: BaseModel) -> bytes:
 def read_record(kind: type[Kind], file: Path, *, remedy: str = "") -> Kind:
     """Reads a record written by `write_record`.
 
-    Args:
-        remedy: end of the message if the content is not valid.
-
     Raises:
         CheckpointError: the file is missing, or its content is not a valid `kind`.
     """

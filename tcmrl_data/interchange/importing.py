@@ -42,9 +42,7 @@ class ImportReport:
 
     Attributes:
         environment: its name, `foreign` for one that is not ours.
-        horizon: steps of the longest episode.
         notes: what was cut or left out of the files, in words.
-        root: of the dataset; None where nothing was written.
     """
 
     out: Path
@@ -84,10 +82,8 @@ def import_dataset(
     has no parameters unless the files or `tasks` name them.
 
     Args:
-        format_name: a reader, such as `hdf5`.
         paths: files or folders, whichever the format has. Where they do not name their tasks, the first
             is task 0, the second task 1 and so on.
-        out: folder of the new dataset.
         environment: one of ours that the episodes come from; otherwise the dataset's environment is
             `foreign`, which has sizes and cannot be simulated.
         task: index of the first path's task, instead of 0.
@@ -196,7 +192,6 @@ class _Survey:
 
     Attributes:
         tasks: as the files describe them, by index.
-        horizon: steps of the longest episode.
         extras: dtypes of the per-step arrays that all episodes have, by name; None before the first one.
     """
 

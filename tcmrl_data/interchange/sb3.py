@@ -19,11 +19,6 @@ def to_sb3_buffer(selection: Selection, task: int, *, device: str = "cpu") -> "R
     The buffer handles time limits: a batch's `dones` are 1 where the task itself ended the episode, and 0
     where a time limit did, so that the value of the last observation counts.
 
-    Args:
-        selection: what to take.
-        task: index of a selected task.
-        device: where sampled batches go.
-
     Raises:
         SelectionError: the selection does not hold the task, or no transition of it.
 

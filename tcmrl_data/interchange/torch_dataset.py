@@ -32,7 +32,6 @@ class TrajectoryDataset(Dataset[Item]):
     scalars. Lengths differ where episodes end early: `collate` pads.
 
     Args:
-        selection: what to serve.
         kept_parts: parts that stay in memory after they were read, the least recently used dropped first;
             all of them where None.
 

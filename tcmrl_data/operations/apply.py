@@ -38,11 +38,9 @@ def apply_operation(
     operation, if they have the parts that these were made from: merge the two datasets for it.
 
     Args:
-        path: a dataset or a view.
         out: folder of the new dataset, which holds the new parts alone, in a run with the operation's name.
         operation: name of a plug-in of `tcmrl.operations`.
         tasks: indices of the tasks whose parts are taken; all where None.
-        snapshots: rule of `Dataset.select`.
         workers: processes at the same time; one per core where None.
 
     Raises:

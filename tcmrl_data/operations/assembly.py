@@ -84,7 +84,6 @@ class Plan:
 
     Attributes:
         runs: how the parts were made, the first with a recipe.
-        derivation: how it follows from its sources.
     """
 
     name: str
@@ -118,7 +117,6 @@ def derivation_of(
 
     Args:
         settings: JSON values that the result follows from, together with the sources.
-        sources: the datasets that it is made from.
         splits: of tasks whose split is not as the recipe draws it; None takes them over from the sources.
     """
     if splits is None:
@@ -286,7 +284,6 @@ def append_parts(dataset: Dataset, *, runs: Sequence[Run], parts: Sequence[Publi
     as it was, with files of parts that the same command finds again. The caller holds the dataset's lock.
 
     Args:
-        runs: all runs of the dataset from now on.
         parts: the new parts, whose files are in their places.
 
     Raises:

@@ -55,13 +55,9 @@ class Derived:
     """What a derivation made, or would make.
 
     Attributes:
-        out: the dataset's folder or the view's file.
         cut: number of parts among them that were made anew.
         bytes: size of the archives; before parts are cut, that of the whole parts.
-        test_tasks: indices of the test tasks.
-        steps: snapshot steps that occur.
         root: None where it is not known, as before parts are cut.
-        sources: roots of the datasets that were read.
         far_from_medium: scores of medium snapshots that are not near 33, by the text of their keys.
     """
 
@@ -102,22 +98,15 @@ def derive_dataset(
     part that they were cut from. The same call, made again after an interruption, goes on.
 
     Args:
-        source: a dataset or a view of one.
-        out: folder of the new dataset.
         view: file of the new view instead, which names parts and copies nothing.
         tier: a quality tier, such as `medium`; `TIERS` lists them.
         snapshots: a rule of `Dataset.select`, instead of a tier.
-        tasks: indices.
-        split: only tasks of this split.
         held_out: chosen tasks that become the test tasks, and all others the training tasks; such as some
             training tasks on which settings are compared, while the test tasks are left out.
         episodes: of each part, a number or a share such as `50%`.
         seed: draws the episodes; None takes the first.
         min_return: only episodes whose undiscounted return reaches it; parts without one are left out.
         drop_arrays: extra arrays, such as `success`, that are left out.
-        label: the new dataset's own name.
-        dry_run: only say what would be made.
-        progress: called with parts done and parts in all.
 
     Raises:
         SelectionError: the choice cannot be read, contradicts itself, or leaves nothing of a task.
@@ -208,7 +197,6 @@ def write_view(
 
     Args:
         file: of the view; its name ends in `.json`.
-        source: the dataset, or a view of it.
         keys: parts of the source, at least one.
 
     Raises:
@@ -255,10 +243,6 @@ LONGEST_LABEL = 200
 
 def rename_dataset(path: str | Path, label: str) -> Manifest:
     """Gives a dataset another label; its digest changes, its root does not, and its folder stays.
-
-    Args:
-        path: the dataset's folder or its `manifest.json`.
-        label: the new name, such as `pr/two-seeds`.
 
     Returns:
         The new manifest.

@@ -34,7 +34,6 @@ class ExtendReport:
     Attributes:
         made: number of new parts; of parts that would be new after `dry_run`.
         present: parts that the dataset had already.
-        root: of the dataset; None after `dry_run`.
     """
 
     dataset: Path
@@ -69,13 +68,11 @@ def extend_dataset(
     new parts are a run of their own. What is there already is kept, so the same call goes on after a stop.
 
     Args:
-        path: the dataset's folder or its `manifest.json`.
         episodes: of every new part; a multiple of the recipe's lanes.
         out: folder of a new dataset with all old and the new parts; None adds the parts to the dataset.
         run: name of the new run. With `cross`, further runs `<run>-2`, … hold what else comes to a task.
         of: run whose policies act.
         tasks: indices of the tasks whose policies act; all where None.
-        snapshots: rule of `Dataset.select`.
         first_episode: number of the first episode, a multiple of the lanes; that after the run's last one
             where None.
         noise: standard deviation of normal noise that is added to actions, before they are clipped.
@@ -84,8 +81,6 @@ def extend_dataset(
         allow_drift: also on another platform than that of the stored parts, where episodes are not those that
             their platform would give.
         workers: processes at the same time; one per core where None.
-        dry_run: only check and count; write nothing.
-        progress: called with parts done and parts in all.
 
     Raises:
         SelectionError: an unknown run, nothing selected, or no tasks nearby.

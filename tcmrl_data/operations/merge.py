@@ -44,13 +44,9 @@ def merge_datasets(
 
     Args:
         sources: datasets or views, at least two.
-        out: folder of the union.
         names: of the run `main` of each source in the union; without names, runs keep theirs where they are
             free, and the others are called by their seed or kind.
         split_from: the source that decides which tasks are training tasks, where sources disagree.
-        label: the union's own name.
-        dry_run: only say what would be made.
-        progress: called with parts done and parts in all.
 
     Raises:
         SelectionError: fewer than two sources, or sources that disagree; names what, and both values.

@@ -35,11 +35,7 @@ class PullReport:
     """What a pull did.
 
     Attributes:
-        out: the folder.
-        root: of the dataset in it.
-        parts: number of its parts.
         fetched_parts: number of parts that were not there yet.
-        fetched_bytes: their size.
     """
 
     out: Path
@@ -67,8 +63,6 @@ def pull_dataset(
     Args:
         url: such as `s3://bucket/point-robot` or `https://host/point-robot`, with `@TAG` behind it for a tag.
         out: the folder: free, empty, or one where the same pull was stopped, or had ended.
-        tasks: indices.
-        split: only tasks of this split.
         snapshots: a rule of `Dataset.select`, instead of a tier.
         tier: a quality tier, such as `medium`.
         progress: called with bytes that are there, and bytes in all.

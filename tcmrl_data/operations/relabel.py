@@ -35,7 +35,6 @@ class RelabelReport:
 
     Attributes:
         runs: its runs; each holds one source per task.
-        root: of the dataset; None after `dry_run`.
     """
 
     dataset: Path
@@ -68,21 +67,17 @@ def relabel_dataset(
     reward function has to be known. The same call goes on after a stop.
 
     Args:
-        path: a dataset or a view.
         out: folder of the new dataset, which holds relabelled parts alone; merge it with the old one for
             both.
         to: indices of the tasks whose rewards are wanted, `all`, or `nearest:K`: from every task to the K
             nearest ones of its split, by parameters.
         tasks: indices of the tasks whose episodes are taken; all training tasks where None.
-        snapshots: rule of `Dataset.select`.
         of: run whose parts are taken.
         run: name of the new run; what else comes to a task is in runs `<run>-2`, ….
         allow_test: take test tasks too. Training refuses what comes from them, unless its selection allows
             it.
-        label: the new dataset's own name.
         workers: processes at the same time; one per core where None.
         dry_run: only check, count, and try one part per task; write nothing.
-        progress: called with parts done and parts in all.
 
     Raises:
         SelectionError: a test task without `allow_test`, an unknown run, or nothing selected.

@@ -41,14 +41,9 @@ def split_dataset(
     Of `episodes=(45, 5)` the first dataset has the first 45 episodes of every part and the second the next 5.
 
     Args:
-        source: a dataset or a view of one.
-        out: folder in which the datasets are made.
-        folds: number of folds.
-        seed: draws the folds.
         episodes: numbers of episodes, one per dataset, instead of folds.
         names: of the datasets, for their folders; 0, 1, … without names.
         views: make a view file per fold, `out/0.json`, instead of copying all parts.
-        dry_run: only say what would be made.
         progress: called with parts done and parts in all, over all datasets.
 
     Raises:

@@ -40,7 +40,6 @@ class DeriveSpec:
     """What a worker is told, as JSON.
 
     Attributes:
-        source: folder of the dataset that is read.
         out: folder where parts are published; may be the same one.
         settings: what the settings of all its parts have in common.
         seed: root seed of the parts that are read, and of the new ones; None where it is not known.

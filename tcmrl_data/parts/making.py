@@ -53,7 +53,6 @@ def make_part(
 
     Args:
         wanted: the part's identity but for its arrays.
-        episodes: at least one.
         behavior: what the behavior source records with its parts.
     """
     arrays = pack(episodes)

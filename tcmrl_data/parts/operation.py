@@ -60,7 +60,6 @@ class StoredPart:
     """A part that lies in a dataset or an archive; its arrays are read when they are asked for.
 
     Attributes:
-        place: its file, for messages.
         snapshot: the policy; None where it is not known.
         first: number of the first episodes that are read; all where None.
     """

@@ -40,7 +40,6 @@ class SnapshotCoverage(measured.MeasuredPart):
     """The coverage of a part.
 
     Attributes:
-        cells: number of different state-action cells.
         saco: `cells` as a share of the cells of all parts of the task.
         tq: trajectory quality, as in `SnapshotQuality`.
     """
@@ -112,7 +111,6 @@ def measure_coverage(
         dataset: one part at a time is in memory.
         cell: width of a cell in standard deviations.
         overlap_tasks: number of tasks in the matrix of overlaps.
-        progress: called with parts done and parts in all.
 
     Raises:
         SelectionError: no part has steps, or `cell` is not positive.

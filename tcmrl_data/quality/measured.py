@@ -97,7 +97,6 @@ class PartSteps:
         observations: (steps, observation_dim), before the step.
         actions: (steps, action_dim).
         next_observations: (steps, observation_dim), after the step.
-        lengths: number of steps of every episode.
     """
 
     observations: FloatArray

@@ -77,8 +77,6 @@ def measure_rewards(
 
     Args:
         dataset: one part at a time is in memory.
-        bins: number of bins, of equal width.
-        progress: called with parts done and parts in all.
 
     Raises:
         SelectionError: no part has steps, or there would be no bin.

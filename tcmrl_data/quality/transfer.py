@@ -91,7 +91,6 @@ def measure_transfer(
         dataset: with its policies and an environment that is installed.
         tasks: most tasks that take part, evenly spread over both splits; None for 100, or 20 where a task is
             simulated.
-        deterministic: act without the policies' noise.
         progress: called with episodes done and episodes in all.
 
     Raises:

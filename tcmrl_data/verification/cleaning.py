@@ -48,7 +48,6 @@ def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage
     """Removes abandoned staging, and checkpoints of units all of whose tasks have all parts published.
 
     Args:
-        path: the dataset's folder or its `manifest.json`.
         dry_run: only return what would be removed; change nothing.
 
     Raises:
@@ -149,10 +148,6 @@ def delete_dataset(path: str | Path, *, dry_run: bool = False) -> Deletion:
 
     The manifest goes first, so that an interrupted deletion leaves no dataset that lacks parts; the same call
     goes on. Files that are no part of a dataset stay and are named.
-
-    Args:
-        path: the dataset's folder or its `manifest.json`.
-        dry_run: only say what would be removed.
 
     Raises:
         StoreError: there is no dataset at the path, or the path is a link or a view.

@@ -50,7 +50,6 @@ class PartChecks:
         """Yields what is wrong with a part.
 
         Args:
-            status: its status; None where it is missing.
             entry: its line in the table; None where the table cannot tell.
         """
         if status is None:

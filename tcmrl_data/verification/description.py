@@ -40,10 +40,6 @@ class Finding:
 
     Attributes:
         file: path relative to the dataset; a folder where a whole folder is meant.
-        problem: what is wrong with it.
-        task: task of the part that it belongs to.
-        step: snapshot step of that part.
-        run: run of that part.
         foreign: it belongs to nothing that the manifest names; repair leaves it alone.
     """
 
@@ -87,7 +83,6 @@ class Scan:
 
     Attributes:
         files: status of everything that is no folder, such as a link to a folder that parts do not lie in.
-        empty_folders: folders that hold nothing.
         problems: folders that could not be listed, or lie too deep, and why.
         hidden: folders of others, such as `.git`, which are left alone.
     """
@@ -150,7 +145,6 @@ class Description:
         manifest: None where it cannot be read.
         tasks: of the table; none where it cannot be read.
         table: the parts; empty where it cannot be read.
-        unreadable: tables that cannot be read.
         findings: what is wrong with manifest and tables.
     """
 

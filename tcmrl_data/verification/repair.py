@@ -76,9 +76,7 @@ class RepairReport:
         left: findings that a repair leaves to people: foreign files, and values of the manifest.
         failed: one line per task that could not be made again; the dataset is then as it was.
         read_only: the folder cannot be written, and nothing had to be.
-        copied: keys of the parts that were taken from the copy.
         accepted: keys of the parts that were made again and came out with other ids.
-        root: of the dataset as it now stands.
     """
 
     dataset: Path
@@ -109,14 +107,11 @@ def repair_dataset(
     have the manifest's root. Foreign files stay and are named.
 
     Args:
-        path: the dataset's folder or its `manifest.json`.
         level: level of the verification that selects the parts.
-        workers: units run at the same time.
         copy: a dataset that holds some of the parts too; those are taken from it, if they have the digests
             of the table.
         accept: also make parts again whose platform is another one than this, and take them as they come out.
             The dataset then has another root, and the origin of its first run says which parts are new.
-        progress: called with the events of the build.
 
     Raises:
         ManifestError: the manifest and its copy are damaged. Delete both and the parts that `verify` names,
@@ -328,11 +323,7 @@ def _build_again(
     workers: int | None,
     progress: Callable[[BuildEvent], None] | None,
 ) -> tuple[str, ...]:
-    """Builds the tasks of damaged parts in a folder, where their sound parts lie; their groups train along.
-
-    Args:
-        progress: called with the events of the build.
-    """
+    """Builds the tasks of damaged parts in a folder with their sound parts; their groups train along."""
     assert run.recipe is not None
     assert run.seed is not None
     tasks = {key.task for key in keys}

@@ -56,7 +56,6 @@ class VerifyReport:
 
     Attributes:
         files: number of files found, without work files.
-        findings: everything that is wrong, ordered by file.
         notes: files of others beside the data; findings with `strict`.
     """
 
@@ -84,14 +83,11 @@ def verify_dataset(
     """Checks every file of a dataset and reports the findings; changes nothing.
 
     Args:
-        path: the dataset's folder or its `manifest.json`.
-        level: the checks to make, see the module.
         replay: number of parts to make again from their snapshots and seeds, spread over the dataset.
         sample: number of parts, spread over the dataset, of which more than name and size is checked; all
             where None.
         strict: files of others beside the data are findings.
         sources: datasets with parts that parts of this one were made from, to make these again.
-        progress: called with parts done and parts in all.
 
     Raises:
         ManifestError: there is no dataset at the path, or it is a view.
