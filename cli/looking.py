@@ -169,7 +169,7 @@ def dataset_report(dataset: Path, out: Path | None, episodes: int, transfer: boo
     type=FILE,
     required=True,
     metavar="FILE",
-    help="File to write: .webp or .mp4 for a film, .png for a strip of stills.",
+    help="File to write: .webp or .gif for a film, .png for a strip of stills.",
 )
 @click.option(
     "--frames",
@@ -201,7 +201,7 @@ def render(
     The episode is played again from its stored seed and actions. Every observation, reward and end must be
     equal to the stored one bit for bit, otherwise nothing is written and the first step that differs is
     named. Simulated robots need OpenGL: a graphics driver, or Mesa's libegl1 or libosmesa6, which draw on the
-    processor. MUJOCO_GL=egl or MUJOCO_GL=osmesa chooses one. A film of the kind .mp4 needs ffmpeg.
+    processor. MUJOCO_GL=egl or MUJOCO_GL=osmesa chooses one.
 
     \b
     Examples:

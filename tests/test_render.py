@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -121,25 +120,21 @@ def test_a_strip_has_stills_side_by_side(call: Call, tiny: Dataset, tmp_path: Pa
         assert (strip.format, strip.size) == ("PNG", (3 * 164, 120 + 2 * 14))
 
 
-@pytest.mark.skipif(shutil.which("ffmpeg") is None, reason="ffmpeg is not installed")
-def test_a_film_for_other_players(tiny: Dataset, tmp_path: Path) -> None:
-    render_episode(tiny, tmp_path / "film.mp4", task=TASK, frames=4, width=66)
-    assert (tmp_path / "film.mp4").read_bytes()[4:8] == b"ftyp"
+def test_a_film_for_slides(tiny: Dataset, tmp_path: Path) -> None:
+    render_episode(tiny, tmp_path / "film.gif", task=TASK, frames=4, width=66)
+    with Image.open(tmp_path / "film.gif") as film_file:
+        assert (film_file.format, film_file.n_frames, film_file.width) == ("GIF", 4, 64)  # type: ignore[attr-defined]
 
 
-def test_bad_input_writes_nothing(
-    call: Call, tiny: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bad_input_writes_nothing(call: Call, tiny: Dataset, tmp_path: Path) -> None:
     def refused(name: str, *options: object) -> tuple[int, str, str]:
         return call("render", tiny.folder, "--quiet", "--out", tmp_path / name, *options)
 
-    assert_refused(refused("film.gif", "--task", TASK), "film.gif", ".webp, .png, .mp4")
+    assert_refused(refused("film.mp4", "--task", TASK), "film.mp4", ".webp, .png, .gif")
     assert_refused(refused("film.webp", "--task", 1), "no task 1")
     assert_refused(refused("film.webp", "--task", TASK, "--step", 99), "its steps are [0, 100, 150]")
     assert_refused(refused("film.webp", "--task", TASK, "--run", "more"), "no part of that run")
     assert_refused(refused("film.webp", "--task", TASK, "--episode", 6), "has 6 episodes")
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert_refused(refused("film.mp4", "--task", TASK), "ffmpeg", ".webp")
     assert list(tmp_path.iterdir()) == []
 
 

@@ -1,10 +1,7 @@
-"""`render_episode`: a stored episode as an animated WebP, an MP4 film, or a strip of stills as PNG."""
+"""`render_episode`: a stored episode as an animated WebP or GIF, or a strip of stills as PNG."""
 
 import functools
 import io
-import shutil
-import subprocess
-import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +17,7 @@ from tcmrl_data.foundation.errors import RenderingError, SelectionError, Simulat
 from tcmrl_data.store.part import this_platform
 from tcmrl_data.store.tables import MAIN_RUN, PartKey
 
-ENDINGS = (".webp", ".png", ".mp4")
+ENDINGS = (".webp", ".png", ".gif")
 STRIP_ENDING = ".png"
 
 FILM_MS = 4_000
@@ -79,7 +76,7 @@ def render_episode(
     Every observation, reward and end must come back bit for bit, or nothing is written.
 
     Args:
-        out: file to write: `.webp` or `.mp4` for a film, `.png` for a strip of stills.
+        out: file to write: `.webp` or `.gif` for a film, `.png` for a strip of stills.
         step: snapshot step; the task's last one where None.
         frames: most pictures, evenly spread over the episode; 100 of a film and 5 of a strip where None.
         width: of a picture in pixels; its height is three quarters of it.
@@ -103,7 +100,7 @@ def render_episode(
     key = _find_part(dataset, task, step, run)
     stored = find_episode(dataset, key, episode)
     is_strip = out.suffix.lower() == STRIP_ENDING
-    width -= width % 4  # so that height and width are even
+    width -= width % 4  # so that the height is three quarters of it
     taken = _film(
         dataset, stored, frames or (STRIP_FRAMES if is_strip else FILM_FRAMES), width, progress=progress
     )
@@ -202,11 +199,6 @@ def _still(frame: Frame) -> Picture:
 def _check_ending(file: Path) -> None:
     if file.suffix.lower() not in ENDINGS:
         raise RenderingError(f"--out {file}: the name must end in {', '.join(ENDINGS)}")
-    if file.suffix.lower() == ".mp4" and shutil.which("ffmpeg") is None:
-        raise RenderingError(
-            f"--out {file}: MP4 films are made by the program ffmpeg, which is not installed; install it, "
-            "or choose a name that ends in .webp"
-        )
 
 
 def _encode(pictures: Sequence[Picture], ending: str) -> bytes:
@@ -215,58 +207,18 @@ def _encode(pictures: Sequence[Picture], ending: str) -> bytes:
     Args:
         pictures: of a film in order, all of one size; of a strip, the finished strip alone.
     """
-    if ending == STRIP_ENDING:
-        return _png(pictures[0])
-    shown = min(max(FILM_MS // len(pictures), SHORTEST_MS), LONGEST_MS)
-    return _webp(pictures, shown) if ending == ".webp" else _mp4(pictures, shown)
-
-
-def _png(strip: Picture) -> bytes:
-    """A PNG with a palette, a third of the size of one without."""
-    from PIL import Image
-
-    image = Image.fromarray(strip).quantize(STRIP_COLORS, dither=Image.Dither.NONE)
-    target = io.BytesIO()
-    image.save(target, "PNG", optimize=True)
-    return target.getvalue()
-
-
-def _webp(pictures: Sequence[Picture], shown: int) -> bytes:
     from PIL import Image
 
     first, *others = [Image.fromarray(picture) for picture in pictures]
     target = io.BytesIO()
-    first.save(
-        target,
-        "WEBP",
-        save_all=True,
-        append_images=others,
-        duration=[shown] * len(others) + [LAST_MS],
-        loop=0,
-        quality=WEBP_QUALITY,
-        method=4,
-    )
+    if ending == STRIP_ENDING:  # with a palette a third of the size of one without
+        first.quantize(STRIP_COLORS, dither=Image.Dither.NONE).save(target, "PNG", optimize=True)
+        return target.getvalue()
+    shown = min(max(FILM_MS // len(pictures), SHORTEST_MS), LONGEST_MS)
+    durations = [shown] * len(others) + [LAST_MS]
+    options = {"quality": WEBP_QUALITY, "method": 4} if ending == ".webp" else {}
+    first.save(target, ending[1:], save_all=True, append_images=others, duration=durations, loop=0, **options)
     return target.getvalue()
-
-
-def _mp4(pictures: Sequence[Picture], shown: int) -> bytes:
-    """H.264, which browsers show."""
-    height, width, _ = pictures[0].shape
-    frames = [*pictures, *[pictures[-1]] * (LAST_MS // shown)]
-    with tempfile.TemporaryDirectory() as folder:
-        file = Path(folder, "film.mp4")
-        source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(1_000 / shown)]
-        target = ["-pix_fmt", "yuv420p", "-movflags", "+faststart", str(file)]
-        done = subprocess.run(
-            ["ffmpeg", "-v", "error", *source, "-i", "-", *target],
-            input=np.stack(frames).tobytes(),
-            capture_output=True,
-            check=False,
-        )
-        if done.returncode:
-            words = done.stderr.decode(errors="replace").strip().splitlines() or ["no message"]
-            raise RenderingError(f"ffmpeg cannot make a film: {words[-1][:200]}; choose a .webp file")
-        return file.read_bytes()
 
 
 def _line_of_words(text: str, width: int, height: int) -> Picture:
