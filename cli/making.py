@@ -374,7 +374,7 @@ def import_data(
     \b
     Examples:
       tcmrl-data import hdf5 hopper_medium.hdf5 --out data/hopper
-      tcmrl-data import hdf5 a.hdf5 --option observation_keys=eef,object --out data/a
+      tcmrl-data import hdf5 a.hdf5 --option observation_keys=a,b --out b
       tcmrl-data import minari ~/.minari/datasets/D4RL/door/human-v2 --out a
       tcmrl-data import idaq-npy cheetah --environment half-cheetah-vel --out a
     """
