@@ -35,9 +35,9 @@ GONE = {
     "tcmrl-data inspect rewards --bins": "bins of tcmrl_data.measure_rewards in Python",
     "tcmrl-data inspect transfer --deterministic": "deterministic of tcmrl_data.measure_transfer in Python",
     "tcmrl-data inspect worth --transitions": "transitions of tcmrl_data.measure_worth in Python",
-    "tcmrl-data derive --tolerance": "tolerance of tcmrl_data.derive_dataset in Python",
+    "tcmrl-data derive --tolerance": "far_from_medium of `tcmrl-data derive --json`",
     "tcmrl-data cache verify": "tcmrl_data.verify_cache in Python, or tcmrl-data cache clear",
-    "tcmrl-data derive --strict": "strict of tcmrl_data.derive_dataset in Python",
+    "tcmrl-data derive --strict": "far_from_medium of `tcmrl-data derive --json`",
     "tcmrl-data inspect transfer --tasks": "--max-tasks",
     "tcmrl-data inspect worth --tasks": "--max-tasks",
 }
