@@ -9,14 +9,24 @@ import click
 
 from tcmrl_data.foundation.machine import size
 
-from .frame import output_options, print_json, remark, stopped_by_signals, typed_command
+from .frame import (
+    output_options,
+    print_json,
+    print_properties,
+    remark,
+    stopped_by_signals,
+    typed_command,
+)
 from .options import DATASET, SNAPSHOTS, SPLIT, TASKS, TIER, indices
 from .progress import StageProgress
 
 if TYPE_CHECKING:
+    from tcmrl_data import PushPlan
     from tcmrl_data.envs.base import Split
 
 Made = TypeVar("Made")
+
+PRICE = click.FloatRange(min=0)
 
 
 @click.command()
@@ -24,8 +34,20 @@ Made = TypeVar("Made")
 @click.argument("url")
 @click.option("--tag", metavar="NAME", help="A name for this state of DATASET: it is opened as URL@NAME.")
 @click.option("--move", is_flag=True, help="The tag may name another dataset so far.")
+@click.option("--plan", is_flag=True, help="Only print what would be sent: bytes, requests and price.")
+@click.option("--price-per-gb", type=PRICE, metavar="PRICE", help="Such as a GB of storage costs a month.")
+@click.option("--price-per-1000-requests", type=PRICE, metavar="PRICE", help="Such as 1,000 writes cost.")
 @output_options
-def push(dataset: Path, url: str, tag: str | None, move: bool, as_json: bool) -> None:
+def push(
+    dataset: Path,
+    url: str,
+    tag: str | None,
+    move: bool,
+    plan: bool,
+    price_per_gb: float | None,
+    price_per_1000_requests: float | None,
+    as_json: bool,
+) -> None:
     """Copy DATASET to URL, a folder of a bucket such as s3://bucket/point-robot.
 
     Without --tag, URL becomes the address of this dataset for good. Under tags the same URL keeps further
@@ -36,11 +58,18 @@ def push(dataset: Path, url: str, tag: str | None, move: bool, as_json: bool) ->
     Examples:
       tcmrl-data push data/point-robot s3://bucket/point-robot
       tcmrl-data push data/point-robot-medium s3://bucket/point-robot --tag medium
+      tcmrl-data push data/point-robot s3://bucket/point-robot --plan --price-per-gb 0.023
     """
     import tcmrl_data
 
     if move and tag is None:
         raise click.UsageError("--move is for tags; name one by --tag.")
+    if plan:
+        planned = tcmrl_data.plan_push(dataset, url, tag=tag, move=move)
+        _print_plan(planned, [price_per_gb, price_per_1000_requests], as_json=as_json)
+        return
+    if price_per_gb is not None or price_per_1000_requests is not None:
+        raise click.UsageError("prices are for --plan; add it.")
     done = _in_bytes(
         lambda progress: tcmrl_data.push_dataset(dataset, url, tag=tag, move=move, progress=progress),
         stage="pushing",
@@ -55,6 +84,23 @@ def push(dataset: Path, url: str, tag: str | None, move: bool, as_json: bool) ->
         f"{size(done.sent_bytes)}, root {done.root[:12]}"
     )
     remark(f"Next: tcmrl-data show {done.address}")
+
+
+def _print_plan(plan: "PushPlan", prices: list[float | None], *, as_json: bool) -> None:
+    amounts = (plan.missing_bytes / 1e9, plan.requests / 1e3)
+    costs = [amount * price for amount, price in zip(amounts, prices, strict=True) if price is not None]
+    if as_json:
+        print_json(dataclasses.asdict(plan) | {"price": sum(costs) if costs else None})
+        return
+    rows = {
+        "root": plan.root[:12],
+        "parts": f"{plan.parts:,}, {plan.missing_parts:,} of them to send",
+        "size": f"{size(plan.missing_bytes)} to send, with tables",
+        "requests": f"{plan.requests:,}, if none is made again",
+    }
+    if costs:
+        rows["price"] = f"{sum(costs):.4g}, by the prices given"
+    print_properties(f"Plan: push to {plan.address}", rows)
 
 
 @click.command()

@@ -138,9 +138,9 @@ def train(
     from tcmrl_data import open_dataset, parse_bytes
 
     limit = parse_bytes(memory_limit) if memory_limit else None
-    if resume and not dataset.exists():
+    if resume and isinstance(dataset, Path) and not dataset.exists():  # else it is an address
         raise click.ClickException(f"{dataset} does not exist; name the present folder of the run's dataset")
-    if (dataset / "run.json").is_file():
+    if isinstance(dataset, Path) and (dataset / "run.json").is_file():
         raise click.ClickException(
             f"{dataset} is a run, not a dataset; to continue it, run `tcmrl train DATASET --resume --out "
             f"{shlex.quote(str(dataset))}`"

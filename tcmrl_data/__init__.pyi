@@ -98,7 +98,9 @@ from .recipe.values import recipe_values as recipe_values
 from .remote.address import Address as Address
 from .remote.address import is_url as is_url
 from .remote.files import clear_fetched as clear_fetched
+from .remote.local import PushPlan as PushPlan
 from .remote.local import PushReport as PushReport
+from .remote.push import plan_push as plan_push
 from .sampling.cache import CacheEntry as CacheEntry
 from .sampling.cache import clear_cache as clear_cache
 from .sampling.cache import list_cache as list_cache

@@ -1,8 +1,9 @@
 """Datasets beyond this disk: pushed, pulled, opened part by part, tagged; with servers that spoil answers."""
 
+import json
 import shutil
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,17 +12,18 @@ pytest.importorskip("obstore", reason="needs the extra `remote`")
 pytest.importorskip("moto", reason="needs the extra `test`")
 
 from tcmrl_cli.data import data
+from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
-from tcmrl_algo import train_run
+from tcmrl_algo import open_run, train_run
 from tcmrl_data import open_dataset, pull_dataset, push_dataset, verify_dataset
 from tcmrl_data.foundation.errors import ManifestError, RemoteError, StoreError
 from tcmrl_data.remote import objects
 from tcmrl_data.remote.address import parse_address
 from tcmrl_data.store.manifest import MANIFEST
 from tests.commands import assert_refused, in_process
-from tests.remotes import FLAWS, Proxy, folder_server, make_bucket, moto, seaweedfs
-from tests.small_training import config_of
+from tests.remotes import Proxy, folder_server, make_bucket, moto, seaweedfs
+from tests.small_training import SMALL, config_of
 
 FROZEN = Path(__file__).parent / "frozen" / "dataset"
 BUCKET = "bucket"
@@ -108,6 +110,25 @@ def test_what_is_there_is_not_sent_again(bucket: str, server: Proxy, frozen: Pat
     server.reset()
     assert push_dataset(last, bucket, tag="last").sent_bytes == 0
     assert len(server.log) == 1
+
+
+@pytest.mark.parametrize("tag", [None, "v1"])
+def test_a_push_does_what_its_plan_says(
+    bucket: str, server: Proxy, frozen: Path, last: Path, tag: str | None
+) -> None:
+    for folder in (last, frozen) if tag else (frozen,):  # the second finds parts of the first
+        server.reset()
+        plan = tcmrl_data.plan_push(folder, bucket, tag=tag, move=True)
+        assert {method for method, _ in server.log} == {"GET"}
+        server.reset()
+        done = push_dataset(folder, bucket, tag=tag, move=True)
+        assert (plan.address, plan.root, plan.parts) == (done.address, done.root, done.parts)
+        assert (plan.missing_parts, plan.missing_bytes) == (done.sent_parts, done.sent_bytes)
+        assert plan.requests == len(server.log)
+    again = tcmrl_data.plan_push(frozen, bucket, tag=tag)
+    assert (again.missing_parts, again.missing_bytes, again.requests) == (0, 0, 1)
+    with pytest.raises(RemoteError, match="root"):
+        tcmrl_data.plan_push(last, bucket, tag=tag)
 
 
 def test_a_dataset_opens_with_three_requests_and_fetches_what_is_read(
@@ -209,59 +230,6 @@ def test_what_is_damaged_on_this_disk_is_not_sent(bucket: str, frozen: Path, tmp
         open_dataset(bucket)
 
 
-@pytest.fixture
-def each_request(sweep: int) -> Callable[[int], range]:
-    """The requests of a command that are spoilt, of so many."""
-    return lambda number: range(0, number, min(sweep, 8))
-
-
-@pytest.mark.parametrize("flaw", FLAWS)
-@pytest.mark.check
-def test_a_spoilt_request_is_made_again_or_named(
-    bucket: str, server: Proxy, frozen: Path, tmp_path: Path, flaw: str, each_request: Callable[[int], range]
-) -> None:
-    push_dataset(frozen, f"{bucket}-straight", tag="v1")
-    pushes = len(server.log)
-    server.reset()
-    pull_dataset(f"{bucket}-straight@v1", tmp_path / "straight")
-    pulls, root = len(server.log), open_dataset(frozen).manifest.root
-    for spoilt in each_request(pushes):
-        place = f"{bucket}-{spoilt}"
-        server.reset(lambda number, method, path, spoilt=spoilt: flaw if number == spoilt else None)
-        try:
-            push_dataset(frozen, place, tag="v1")
-        except tcmrl_data.TcmrlError:
-            server.reset()
-            push_dataset(frozen, place, tag="v1")
-        server.reset()
-        opened = open_dataset(f"{place}@v1")
-        opened.fetch()
-        assert opened.manifest.root == root
-    for spoilt in each_request(pulls):
-        out = tmp_path / f"out-{spoilt}"
-        server.reset(lambda number, method, path, spoilt=spoilt: flaw if number == spoilt else None)
-        try:
-            pull_dataset(f"{bucket}-straight@v1", out)
-        except tcmrl_data.TcmrlError:
-            assert not (out / MANIFEST).exists()
-            server.reset()
-            pull_dataset(f"{bucket}-straight@v1", out)
-        assert sealed_files(out) == sealed_files(frozen)
-
-
-@pytest.mark.parametrize("flaw", ["drop", "truncate", "flip", "throttle", "unavailable"])
-def test_what_stays_spoilt_is_named(
-    bucket: str, server: Proxy, frozen: Path, tmp_path: Path, flaw: str
-) -> None:
-    push_dataset(frozen, bucket)
-    part = "parts/main/00000/0000000.zip"
-    server.reset(lambda number, method, path: flaw if part in path else None)
-    with pytest.raises(RemoteError, match=part):
-        pull_dataset(bucket, tmp_path / "out")
-    assert not (tmp_path / "out" / MANIFEST).exists()
-    assert not (tmp_path / "out" / part).exists()
-
-
 def test_a_folder_behind_a_web_server_opens_and_is_pulled(frozen: Path, tmp_path: Path) -> None:
     with folder_server(frozen.parent) as address:
         opened = open_dataset(f"{address}/dataset")
@@ -342,6 +310,20 @@ def test_the_commands(
     bucket: str, frozen: Path, last: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     call = in_process(data, capsys)
+    prices = ("--price-per-gb", "0.5", "--price-per-1000-requests", "2")
+    code, output, _ = call("push", frozen, bucket, "--plan", *prices)
+    words = (
+        "9, 9 of them to send",
+        "123.4 kB to send",
+        "15, if none is made again",
+        "0.03006, by the prices",
+    )
+    assert code == 0 and all(word in output for word in words)
+    assert json.loads(call("push", frozen, bucket, "--plan", "--json", *prices)[1])["price"] == pytest.approx(
+        0.5 * 123_431e-9 + 0.03, abs=1e-6
+    )
+    assert_refused(call("push", frozen, bucket, *prices), "prices are for --plan")
+    assert_refused(call("push", frozen, "hf://datasets/a/b", "--plan"), "omit --plan")
     code, output, errors = call("push", frozen, bucket)
     assert (code, output) == (
         0,
@@ -375,7 +357,9 @@ def test_what_nobody_may_use_is_not_pushed(bucket: str, frozen: Path, tmp_path: 
         push_dataset(tmp_path / "imported", bucket)
 
 
-def test_a_dataset_at_an_address_trains_to_the_same_tensors(tiny_folder: Path, tmp_path: Path) -> None:
+def test_a_dataset_at_an_address_trains_to_the_same_tensors(
+    tiny_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     trained = []
     with folder_server(tiny_folder.parent) as address:
         for place in (tiny_folder, f"{address}/{tiny_folder.name}"):
@@ -384,8 +368,10 @@ def test_a_dataset_at_an_address_trains_to_the_same_tensors(tiny_folder: Path, t
             trained.append(train_run(dataset, out, config=config, profile="quick", steps=10).run)
         assert trained[1].record.dataset == f"{address}/{tiny_folder.name}"
         assert trained[1].open_dataset().manifest.root == trained[0].open_dataset().manifest.root
-    left, right = (sorted(run.folder.rglob("*.safetensors")) for run in trained)
-    assert [file.name for file in left] == [file.name for file in right]
-    assert left
-    for mine, other in zip(left, right, strict=True):
-        assert mine.read_bytes() == other.read_bytes()
+        call, small = in_process(tcmrl, capsys), [word for value in SMALL for word in ("--set", value)]
+        typed = ("train", f"{address}/{tiny_folder.name}", "--out", tmp_path / "typed", "--quiet")
+        assert call(*typed, *small, "--stop-at", 5)[0] == 0
+        assert call(*typed, "--resume", "--stop-at", 10)[0] == 0
+        trained.append(open_run(tmp_path / "typed"))
+    assert {run.newest().step for run in trained} == {10}
+    assert len({(run.newest().folder / "tensors.safetensors").read_bytes() for run in trained}) == 1

@@ -40,6 +40,27 @@ class PushReport:
 
 
 @dataclass(frozen=True)
+class PushPlan:
+    """What a push into a bucket would do.
+
+    Attributes:
+        address: what would open the dataset.
+        root: of the dataset.
+        parts: number of its parts.
+        missing_parts: number of parts that the address lacks.
+        missing_bytes: their size, with manifest and tables.
+        requests: that the push would make, if none is made again; the plan's own are among them.
+    """
+
+    address: str
+    root: str
+    parts: int
+    missing_parts: int
+    missing_bytes: int
+    requests: int
+
+
+@dataclass(frozen=True)
 class LocalDataset:
     """A dataset's folder, its manifest, and the bytes of tables and manifest in the order of a push."""
 

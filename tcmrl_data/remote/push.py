@@ -13,11 +13,20 @@ from pathlib import Path
 
 from tcmrl_data.foundation.errors import RemoteError
 from tcmrl_data.foundation.records import record_bytes, sha256
-from tcmrl_data.remote.address import parse_address
+from tcmrl_data.remote.address import Address, parse_address
 from tcmrl_data.remote.files import Progress, counted
 from tcmrl_data.remote.hub import push_to_hub
-from tcmrl_data.remote.local import MEMORY, LocalDataset, PushReport, read_local
-from tcmrl_data.remote.objects import REQUESTS, DamageError, Listed, Objects, OversizeError, Version, each
+from tcmrl_data.remote.local import MEMORY, LocalDataset, PushPlan, PushReport, read_local
+from tcmrl_data.remote.objects import (
+    LISTED,
+    REQUESTS,
+    DamageError,
+    Listed,
+    Objects,
+    OversizeError,
+    Version,
+    each,
+)
 from tcmrl_data.remote.published import (
     CLAIM,
     REF_SCHEMA,
@@ -28,6 +37,7 @@ from tcmrl_data.remote.published import (
     ref_name,
     version_prefix,
 )
+from tcmrl_data.store.manifest import dataset_folder
 from tcmrl_data.store.part_table import PartEntry
 from tcmrl_data.store.tables import PARTS, part_file
 
@@ -48,16 +58,39 @@ def push_folder(
         ManifestError: there is no dataset in the folder, or it names no licence or citation.
         StoreError: a part is missing or damaged.
     """
-    address = parse_address(url)
-    if address.tag is not None:
-        raise RemoteError(f"{address}: name the tag by --tag {address.tag}")
-    address = parse_address(f"{address}@{tag}") if tag else address
-    if address.protocol in ("http", "https"):
-        raise RemoteError(f"{address}: a dataset is only read by {address.protocol}://; push it to a bucket")
+    address = _target(url, tag)
     local = read_local(folder)
     if address.protocol == "hf":
         return push_to_hub(local, address, describe=describe, move=move, progress=progress)
     return _Push(local, Objects(at(address, None)), address.tag).run(move, progress)
+
+
+def plan_push(dataset: str | Path, url: str, *, tag: str | None = None, move: bool = False) -> PushPlan:
+    """What `push_dataset` with the same arguments would send to a bucket. Nothing is sent, or read back.
+
+    Raises:
+        RemoteError: the address or the tag names another dataset, the server refuses something, or it is the
+            Hub.
+        ManifestError: there is no dataset in the folder, or it names no licence or citation.
+
+    Example:
+        >>> plan_push("data/point-robot", "s3://bucket/point-robot").missing_bytes  # doctest: +SKIP
+    """
+    address = _target(url, tag)
+    if address.protocol == "hf":
+        raise RemoteError(f"{address}: only what a push to a bucket takes is planned; omit --plan")
+    local = read_local(dataset_folder(dataset))
+    return _Push(local, Objects(at(address, None)), address.tag).plan(move)
+
+
+def _target(url: str, tag: str | None) -> Address:
+    """The address that a push goes to, with its tag."""
+    address = parse_address(url)
+    if address.tag is not None:
+        raise RemoteError(f"{address}: name the tag by --tag {address.tag}")
+    if address.protocol in ("http", "https"):
+        raise RemoteError(f"{address}: a dataset is only read by {address.protocol}://; push it to a bucket")
+    return parse_address(f"{address}@{tag}") if tag else address
 
 
 class _Push:
@@ -87,6 +120,26 @@ class _Push:
         if self._tag is not None:
             self._name(self._tag, version)
         return self._report(sent, more, before.root if before else None)
+
+    def plan(self, move: bool) -> PushPlan:
+        """What `run` would do."""
+        named, entries = self._named(move), self._local.entries
+        address, root = str(at(self._objects.address, self._tag)), self._ref.root
+        if named and named[0].digest == self._ref.digest:
+            return PushPlan(address, root, len(entries), 0, 0, requests=1)
+        listed = self._objects.listing(PARTS)
+        missing = [entry for entry in entries if part_file(entry.key) not in listed]
+        found = [listed[name] for entry in entries if (name := part_file(entry.key)) in listed]
+        files = self._local.files.values()
+        looks = 1 + max(1, -(-len(listed) // LISTED)) + sum(there.md5 is None for there in found)
+        return PushPlan(
+            address,
+            root,
+            len(entries),
+            len(missing),
+            sum(entry.size for entry in missing) + sum(map(len, files)),
+            requests=looks + len(missing) + len(files) + 1,  # the claim, or the tag
+        )
 
     def _report(self, sent: list[PartEntry], more: int, moved_from: str | None) -> PushReport:
         num_bytes = sum(entry.size for entry in sent) + more
