@@ -36,7 +36,7 @@ GONE = {
     "tcmrl-data inspect transfer --deterministic": "deterministic of tcmrl_data.measure_transfer in Python",
     "tcmrl-data inspect worth --transitions": "transitions of tcmrl_data.measure_worth in Python",
     "tcmrl-data derive --tolerance": "far_from_medium of `tcmrl-data derive --json`",
-    "tcmrl-data cache verify": "tcmrl_data.verify_cache in Python, or tcmrl-data cache clear",
+    "tcmrl-data cache verify": "tcmrl-data cache clear",
     "tcmrl-data derive --strict": "far_from_medium of `tcmrl-data derive --json`",
     "tcmrl-data inspect transfer --tasks": "--max-tasks",
     "tcmrl-data inspect worth --tasks": "--max-tasks",

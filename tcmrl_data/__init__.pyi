@@ -104,7 +104,6 @@ from .remote.push import plan_push as plan_push
 from .sampling.cache import CacheEntry as CacheEntry
 from .sampling.cache import clear_cache as clear_cache
 from .sampling.cache import list_cache as list_cache
-from .sampling.cache import verify_cache as verify_cache
 from .sampling.draws import BatchRequest as BatchRequest
 from .sampling.draws import Trajectories as Trajectories
 from .sampling.draws import Transitions as Transitions

@@ -39,6 +39,19 @@ TINY = (
     "rollouts.lanes=3",
 )
 
+SIMULATED = (
+    "environment.horizon=20",
+    "behavior.source=sac",
+    "behavior.sac.steps=60",
+    "behavior.sac.warmup=30",
+    "behavior.sac.snapshots=[0,60]",
+    "behavior.sac.hidden=[16]",
+    "behavior.sac.batch_size=16",
+    "rollouts.episodes=4",
+    "rollouts.lanes=2",
+)
+"""A robot's behavior in a second."""
+
 QUICK_TO_NOTICE = {
     "RAY_USAGE_STATS_ENABLED": "0",
     "RAY_health_check_period_ms": "500",

@@ -289,21 +289,3 @@ def test_list_and_clear_commands(
     assert "point-robot" in call("cache", "list")[1]
     assert json.loads(call("cache", "clear", "--json")[1]) == {"removed": [entry], "kept": []}
     assert not entries(folder)
-
-
-def test_verify_finds_damage_of_large_entries_that_opening_does_not(
-    selection: Selection, folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cache, "CHECKED_BYTES", 0)
-    rows = cached_rows(selection)
-    (entry,) = entries(folder)
-    assert cache.verify_cache() == ()
-    content = bytearray(entry.read_bytes())
-    content[RECORD_BYTES] ^= 1
-    entry.write_bytes(content)
-    assert content[RECORD_BYTES:].startswith(cached_rows(selection).table.tobytes())
-    ((_, problem),) = cache.verify_cache()
-    assert problem == "its bytes are not those that were written"
-    assert entries(folder)  # in use
-    del rows
-    assert len(cache.verify_cache()) == 1 and not entries(folder)

@@ -18,27 +18,17 @@ from tcmrl_data.foundation.errors import BuildError, NondeterminismError, Select
 from tcmrl_data.store.part import _machine
 from tcmrl_data.store.tables import PartKey
 from tests.commands import assert_refused, in_process
+from tests.conftest import SIMULATED
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
 CopyTiny = Callable[[], Path]
-CHEETAH = (
-    "environment.horizon=20",
-    "behavior.source=sac",
-    "behavior.sac.steps=60",
-    "behavior.sac.warmup=30",
-    "behavior.sac.snapshots=[0,60]",
-    "behavior.sac.hidden=[16]",
-    "behavior.sac.batch_size=16",
-    "rollouts.episodes=4",
-    "rollouts.lanes=2",
-)
 
 
 @pytest.fixture(scope="module")
 def cheetah(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("cheetah") / "data"
-    recipe = tcmrl_data.load_recipe("half-cheetah-vel", profile="quick", overrides=CHEETAH)
+    recipe = tcmrl_data.load_recipe("half-cheetah-vel", profile="quick", overrides=SIMULATED)
     assert tcmrl_data.build_dataset(recipe, folder, tasks=[0, 1], workers=2).failed == ()
     return folder
 

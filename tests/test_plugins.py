@@ -86,17 +86,7 @@ def test_a_group_that_nobody_declares_says_what_to_install(animals: Registry[Ani
             "does not define eat",
         ),
     ],
-    ids=[
-        "raises",
-        "lacks a module",
-        "exits",
-        "syntax",
-        "no class",
-        "wrong type",
-        "instance",
-        "name",
-        "abstract",
-    ],
+    ids=["raises", "lacks", "exits", "syntax", "none", "type", "instance", "name", "abstract"],
 )
 def test_a_broken_plugin_is_named_with_its_package_and_harms_no_other(
     source: str, error: str, declare: Declare, animals: Registry[Animal]

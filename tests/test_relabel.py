@@ -32,21 +32,11 @@ from tcmrl_data.parts.making import make_part
 from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.store.tables import PartKey
 from tests.commands import assert_refused, in_process
+from tests.conftest import SIMULATED
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
 REQUEST = BatchRequest(tasks=2, kinds={"policy": Transitions(4)})
-SMALL = (
-    "environment.horizon=20",
-    "behavior.source=sac",
-    "behavior.sac.steps=60",
-    "behavior.sac.warmup=30",
-    "behavior.sac.snapshots=[0,60]",
-    "behavior.sac.hidden=[16]",
-    "behavior.sac.batch_size=16",
-    "rollouts.episodes=2",
-    "rollouts.lanes=2",
-)
 Build = Callable[[str], Path]
 
 
@@ -56,7 +46,9 @@ def build(tmp_path_factory: pytest.TempPathFactory) -> Build:
 
     def make(environment: str) -> Path:
         folder = tmp_path_factory.mktemp("built") / "data"
-        recipe = tcmrl_data.load_recipe(environment, profile="quick", overrides=SMALL)
+        recipe = tcmrl_data.load_recipe(
+            environment, profile="quick", overrides=[*SIMULATED, "rollouts.episodes=2"]
+        )
         tasks = [
             task.index for task in tcmrl_data.draw_tasks(recipe.make_environment()) if task.split == "train"
         ]

@@ -21,23 +21,13 @@ from tcmrl_data.envs.simulation import SimulatedTask, find_open_gl
 from tcmrl_data.foundation.errors import SelectionError, SimulationError
 from tcmrl_data.store.tables import PartKey
 from tests.commands import Call, assert_refused
+from tests.conftest import SIMULATED
 from tests.environments import environment_of, episodes, parameters_of, some_members
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
 NAMES = [name for family in ENVIRONMENTS.working().values() for name in some_members(family)[:1]]
 TASK = 40
-SIMULATED = (
-    "environment.horizon=12",
-    "behavior.source=sac",
-    "behavior.sac.steps=60",
-    "behavior.sac.warmup=30",
-    "behavior.sac.snapshots=[0,60]",
-    "behavior.sac.hidden=[16]",
-    "behavior.sac.batch_size=16",
-    "rollouts.episodes=4",
-    "rollouts.lanes=2",
-)
 
 
 def stored_episode(name: str) -> tuple[Environment, StoredEpisode]:

@@ -89,18 +89,6 @@ def _make_staging(path: Path) -> None:
             disk.make_folder(path)
 
 
-def write_tree(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Writes files (relative path to content) into a new folder and forces them to disk."""
-    folders = {folder, *(folder / parent for name in files for parent in Path(name).parents)}
-    with named_errors(folder):
-        for path in sorted(folders):
-            disk.make_folder(path)
-        for name, data in files.items():
-            write_file(folder / name, data)
-        for path in sorted(folders, reverse=True):
-            disk.sync(path)
-
-
 def replace_file(path: Path, data: bytes, *, staging: Path | None = None) -> None:
     """Replaces a file atomically: readers see the old content or the new content.
 
@@ -205,7 +193,14 @@ def publish_folder(root: Path, target: Path, files: Mapping[str, bytes], *, atte
     staged = staging / f"{attempt}.{uuid.uuid4().hex}"
     with lock_file(staged.with_name(f"{staged.name}.lock"), "this attempt") as lock:
         try:
-            write_tree(staged, files)
+            folders = {staged, *(staged / parent for name in files for parent in Path(name).parents)}
+            with named_errors(staged):
+                for path in sorted(folders):
+                    disk.make_folder(path)
+                for name, data in files.items():
+                    write_file(staged / name, data)
+                for path in sorted(folders, reverse=True):
+                    disk.sync(path)
             return move_into_place(staged, target)
         finally:
             remove_tree(staged)

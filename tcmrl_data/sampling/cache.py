@@ -10,7 +10,7 @@ One process writes at a time, under the cache's lock; others wait. Before it wri
 entries are removed until all fit below TCMRL_CACHE_LIMIT. A reader holds a shared lock on its entry, so that
 no entry in use is removed.
 
-A file of up to CHECKED_BYTES is hashed whenever it is opened; `verify_cache` hashes all. Nothing
+A file of up to CHECKED_BYTES is hashed whenever it is opened. Nothing
 here guards against a person who may write to the cache's folder: give write access only to those who are
 trusted.
 """
@@ -40,7 +40,7 @@ from tcmrl_data.foundation.disk import (
     remove_tree,
 )
 from tcmrl_data.foundation.errors import CacheError, LockedError, StorageError
-from tcmrl_data.foundation.files import is_locked, one_line, printable, take_shared_lock, try_exclusive_lock
+from tcmrl_data.foundation.files import is_locked, printable, take_shared_lock, try_exclusive_lock
 from tcmrl_data.foundation.machine import available_cores, cache_folder, cache_limit, size
 from tcmrl_data.foundation.records import Record, digest, record_bytes
 from tcmrl_data.sampling.rows import (
@@ -184,7 +184,7 @@ def _open_entry(
         take_shared_lock(file)  # whoever removes an entry holds the exclusive lock only briefly
         limit = CHECKED_BYTES if checked is None else checked
         is_whole = os.fstat(file.fileno()).st_size == entry_bytes(selection, dense=dense)
-        if not is_current(file, entry) or not is_whole or _problem(file, limit=limit):
+        if not is_current(file, entry) or not is_whole or _is_damaged(file, limit=limit):
             return None
         with contextlib.suppress(OSError):  # a cache that may only be read
             os.utime(entry)
@@ -242,22 +242,12 @@ def _read_record(file: BinaryIO) -> EntryRecord | None:
         return None
 
 
-def _problem(file: BinaryIO, *, limit: int | None = None) -> str | None:
-    """Why an entry is damaged, in words; None if nothing is found.
-
-    Args:
-        limit: a file above this size, in bytes, is not hashed; None hashes every file.
-    """
+def _is_damaged(file: BinaryIO, *, limit: int) -> bool:
+    """Whether an entry is not as it was written; a file above `limit` bytes is not hashed."""
     record = _read_record(file)
     if record is None:
-        return "its record is damaged, or of another version"
-    if limit is not None and os.fstat(file.fileno()).st_size > limit:
-        return None
-    try:
-        is_same = _digest_of(file) == record.digest
-    except OSError as error:
-        return f"it cannot be read ({one_line(error)})"
-    return None if is_same else "its bytes are not those that were written"
+        return True
+    return os.fstat(file.fileno()).st_size <= limit and _digest_of(file) != record.digest
 
 
 def _digest_of(file: BinaryIO) -> str:
@@ -295,28 +285,6 @@ def clear_cache() -> tuple[CacheEntry, ...]:
     """
     with _named_cache(cache_folder()):
         return tuple(entry for entry in list_cache() if _remove(_file_of(entry.key)))
-
-
-def verify_cache() -> tuple[tuple[CacheEntry, str], ...]:
-    """Hashes all entries and removes the damaged ones that no process reads.
-
-    Returns:
-        The damaged entries, each with its problem in words; `list_cache` still holds those that are in use.
-
-    Raises:
-        CacheError: a damaged entry cannot be removed, because the cache's folder cannot be written.
-    """
-    damaged = []
-    with _named_cache(cache_folder()):
-        for entry in list_cache():
-            file = _file_of(entry.key)
-            with contextlib.suppress(FileNotFoundError):  # removed meanwhile
-                with file.open("rb") as opened:
-                    problem = _problem(opened)
-                if problem:
-                    damaged.append((entry, problem))
-                    _remove(file)
-    return tuple(damaged)
 
 
 def _make_room(folder: Path, needed: int) -> None:

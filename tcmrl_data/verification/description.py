@@ -73,17 +73,13 @@ def finding(file: str, problem: str, *, foreign: bool = False) -> Finding:
     return Finding(file, problem, key.task, key.step, key.run, foreign)
 
 
-MAX_DEPTH = 10
-"""Parts lie 3 folders deep."""
-
-
 @dataclass(frozen=True)
 class Scan:
     """What lies in a folder, by relative path.
 
     Attributes:
         files: status of everything that is no folder, such as a link to a folder that parts do not lie in.
-        problems: folders that could not be listed, or lie too deep, and why.
+        problems: folders that could not be listed, and why.
         hidden: folders of others, such as `.git`, which are left alone.
     """
 
@@ -128,8 +124,6 @@ def scan_dataset(folder: Path, *, follow: bool = True) -> Scan:
             is_folder = stat.S_ISDIR(status.st_mode)
             if is_folder and entry.name.startswith(".") and path not in WORK_FOLDERS:
                 scan.hidden.add(path)
-            elif is_folder and path.count("/") >= MAX_DEPTH:
-                scan.problems[path] = "lies deeper than any folder of a dataset"
             elif is_folder and path not in WORK_FOLDERS:
                 waiting.append(path)
             elif not is_folder and not (path in WORK_FILES and stat.S_ISREG(status.st_mode)):
