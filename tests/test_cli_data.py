@@ -176,42 +176,6 @@ def test_an_output_folder_that_is_no_dataset_is_refused(call: Call, tmp_path: Pa
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
 
-def truncate(file: Path) -> None:
-    file.write_bytes(file.read_bytes()[:1000])
-
-
-def edit(file: Path) -> None:
-    file.write_bytes(file.read_bytes().replace(b'"seed":0', b'"seed":7', 1))
-
-
-def age(file: Path) -> None:
-    document = json.loads(file.read_bytes())
-    file.write_text(json.dumps(document | {"schema_version": 99}))
-
-
-@pytest.mark.parametrize(
-    ("damage", "expected"),
-    [
-        (Path.unlink, "does not exist"),
-        (truncate, "not a manifest"),
-        (edit, "edited or damaged"),
-        (age, "schema_version 99"),
-    ],
-)
-def test_a_bad_manifest_is_refused_by_every_command(
-    call: Call, tiny_copy: Copy, damage: Callable[[Path], None], expected: str
-) -> None:
-    folder = tiny_copy()
-    manifest = folder / "manifest.json"
-    damage(manifest)
-    for arguments in (
-        ("inspect", "returns", folder),
-        ("inspect", "tasks", folder),
-        ("export", folder, "--format", "hdf5"),
-    ):
-        assert_refused(call(*arguments), str(manifest), expected)
-
-
 def test_every_help_has_an_example(call: Call) -> None:
     for name, command in data.commands.items():
         within = list(command.commands) if isinstance(command, click.Group) else []

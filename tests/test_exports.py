@@ -177,13 +177,6 @@ def test_pyarrow_reads_one_table_of_all_files(tiny: Dataset, tmp_path: Path) -> 
     assert json.loads(one.schema.metadata[b"tcmrl"])["split"] == "train"
 
 
-def test_parquet_lies_in_a_folder_per_split(tiny: Dataset, tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow")
-    report = export_dataset(tiny, "parquet", tmp_path / "out", snapshots="last")
-    places = {str(file.relative_to(tmp_path / "out")) for file in report.files}
-    assert places == {f"{task.split}/task_{task.index:05d}.parquet" for task in tiny.tasks}
-
-
 @pytest.mark.parametrize(
     ("name", "episode_bytes"), [("hdf5", 1_500), ("minari", 3_000), ("robomimic", 4_000)]
 )
@@ -209,16 +202,6 @@ def test_hdf5_compresses_long_episodes(
     monkeypatch.setattr(Dataset, "trajectories", lambda self, *key: [episode])
     files = exported(tiny, name, tmp_path / "out", tasks=[0], snapshots="last")
     assert sum(file.stat().st_size for file in files) < 40_000 < episode.observations.nbytes * 2
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_every_format_takes_a_selection(name: str, tiny: Dataset, tmp_path: Path) -> None:
-    files = exported(tiny, name, tmp_path / "out", tasks=[0, 3, 40], split="train", tier="expert")
-    selection = tiny.select(tasks=[0, 3, 40], split="train", tier="expert")
-    report = import_dataset(READERS[name], sources(name, tmp_path / "out", files), tmp_path / "back")
-    keys = [key for keys in selection.parts.values() for key in keys]
-    assert list(open_dataset(tmp_path / "back").parts) == keys
-    assert (report.tasks, {key.task for key in keys}) == (2, {0, 40})
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -9,9 +9,8 @@ from pathlib import Path
 
 import pytest
 
-import tcmrl_data
 from tcmrl_data import Dataset
-from tcmrl_data.foundation.errors import BuildError, CacheError
+from tcmrl_data.foundation.errors import CacheError
 from tcmrl_data.foundation.machine import size
 from tcmrl_data.sampling.cache import cached_rows
 from tests.conftest import TASKS, TINY
@@ -94,16 +93,6 @@ def test_a_read_only_dataset_that_lacks_parts_is_refused_by_name(tiny_copy: Call
     damaged = run_mounted(read_only(copy), "verify", copy, "--repair", "--quiet")
     assert damaged.returncode == 2
     assert damaged.stderr.startswith(f"Error: {copy} cannot be written") and damaged.stderr.count("\n") == 1
-
-
-@pytest.mark.check
-def test_a_build_without_room_says_sizes_in_fitting_units(
-    tiny_recipe: tcmrl_data.Recipe, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    usage = shutil.disk_usage(tmp_path)
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: usage._replace(free=1_234))
-    with pytest.raises(BuildError, match=r"3 parts take up to 8.3 kB, 1.2 kB are free"):
-        tcmrl_data.build_dataset(tiny_recipe, tmp_path / "out", tasks=[0])
 
 
 @pytest.mark.check

@@ -113,14 +113,6 @@ def test_anything_but_an_array_of_numbers_is_refused(value: Any) -> None:
         unpickle_array(pickle.dumps(value)).numbers()
 
 
-def test_a_shape_beyond_the_bytes_is_refused() -> None:
-    data = pickle.dumps(np.zeros(3), protocol=3)  # without frames, whose lengths would tell
-    assert data.count(b"K\x01K\x03\x85") == 1
-    forged = data.replace(b"K\x01K\x03\x85", b"K\x01\x8a\x06\x00\x00\x00\x00\x00\x01\x85")
-    with pytest.raises(PickleRefusedError, match="without their 8796093022208 bytes"):
-        unpickle_array(forged)
-
-
 def test_a_plain_array_has_no_rows(tmp_path: Path) -> None:
     (tmp_path / "d/goal_idx0").mkdir(parents=True)
     np.save(tmp_path / "d/goal_idx0/trj_evalsample0_step0.npy", np.zeros((5, 4)))

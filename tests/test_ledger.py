@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 import tcmrl_data
-from tcmrl_data import BuildEvent, Dataset, Recipe, load_recipe, open_dataset, repair_dataset, verify_dataset
+from tcmrl_data import Dataset, Recipe, load_recipe, open_dataset, repair_dataset, verify_dataset
 from tcmrl_data.building import ledger
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import BuildError, ManifestError, TaskError
@@ -351,15 +351,3 @@ def test_a_field_with_a_new_default_leaves_older_datasets_as_they_are(
     other = load_recipe("point-robot", profile="quick", overrides=[*SHORT, "behavior.observation=full"])
     with pytest.raises(BuildError, match=r"behavior.observation is stored there and full here"):
         tcmrl_data.build_dataset(other, out, tasks=[0])
-
-
-def test_a_build_says_what_it_makes_again(tmp_path: Path) -> None:
-    recipe, out = load_recipe("point-robot", profile="quick", overrides=SHORT), tmp_path / "data"
-    tcmrl_data.build_dataset(recipe, out, tasks=[0])
-    lost = out / part_file(PartKey(3, 0))
-    lost.parent.mkdir()
-    lost.write_bytes(b"PK")
-    events: list[BuildEvent] = []
-    tcmrl_data.build_dataset(recipe, out, tasks=[0, 3], progress=events.append)
-    (warning,) = [event.message for event in events if event.kind == "warning"]
-    assert warning == f"{lost} was damaged before it was recorded; it is made again"
