@@ -264,14 +264,6 @@ def test_one_task_is_not_enough(tiny: Dataset) -> None:
         open_sampler(tiny.select(tasks=[0]), REQUEST, seed=0)
 
 
-def test_too_few_trajectories_are_named(tiny: Dataset) -> None:
-    request = BatchRequest(
-        tasks=3, kinds={"context": Trajectories(30), "execution": Trajectories(1, apart_from="context")}
-    )
-    with pytest.raises(SelectionError, match=r"task 0 has 18 selected trajectories, a batch takes 30"):
-        open_sampler(tiny.select(split="train"), request, seed=0)
-
-
 def test_no_task_parameter_is_reachable_from_a_batch(sampler: Sampler) -> None:
     """The in-memory tasks have only an index: a sampler that reads other fields fails here."""
     assert {field.name for field in dataclasses.fields(Batch)} == {"task_indices", "steps"}
