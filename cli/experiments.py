@@ -128,7 +128,6 @@ def experiment(
     Examples:
       tcmrl experiment --list
       tcmrl experiment tour --workers 2
-      tcmrl experiment window_length --steps 1000 --out results/short
       tcmrl experiment negative_rewards --profile paper --build
       tcmrl experiment table2 --tuned tuning
       tcmrl experiment mine.toml --data /disk/datasets --only TCMRL

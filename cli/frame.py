@@ -247,6 +247,17 @@ def print_rows(
     print_table(table)
 
 
+def print_by_step(
+    title: str, columns: Iterable[str], rows: Iterable[tuple[Any, ...]], *, long_text: Iterable[str] = ()
+) -> None:
+    """Prints rows of step, split and further cells; a step that the row before has too is left out."""
+    shown, before = [], None
+    for step, *cells in rows:
+        shown.append(("" if step == before else f"{step:,}", *cells))
+        before = step
+    print_rows(title, ["step", "split", *columns], shown, text=["split"], long_text=long_text)
+
+
 def print_properties(title: str, properties: Mapping[str, str]) -> None:
     """Prints a table of names and values, which may be long."""
     print_rows(title, ["property", "value"], properties.items(), text=["property"], long_text=["value"])

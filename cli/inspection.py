@@ -10,6 +10,7 @@ import click
 from .frame import (
     number,
     output_options,
+    print_by_step,
     print_json,
     print_rows,
     remark,
@@ -61,16 +62,14 @@ def returns(dataset: Path, as_json: bool, plot: Path | None) -> None:
 
 def _print_returns(name: str, rows: list[dict[str, Any]]) -> None:
     with_success = any(row["success_rate"] is not None for row in rows)
-    columns = ["step", "split", "tasks", "episodes", "mean", "std", "min", "max"]
+    columns = ["tasks", "episodes", "mean", "std", "min", "max"]
     cells = []
-    for previous, row in zip([None, *rows], rows, strict=False):
-        repeated = previous is not None and previous["step"] == row["step"]
+    for row in rows:
         success = [f"{row['success_rate']:.0%}"] if row["success_rate"] is not None else []
         values = (number(row[key]) for key in ("mean", "std", "min", "max"))
         counts = (str(row["tasks"]), f"{row['episodes']:,}")
-        cells.append(("" if repeated else f"{row['step']:,}", row["split"], *counts, *values, *success))
-    heading = f"{name}: mean return of a task, over tasks"
-    print_rows(heading, columns + ["success"] * with_success, cells, text=["split"])
+        cells.append((row["step"], row["split"], *counts, *values, *success))
+    print_by_step(f"{name}: mean return of a task, over tasks", columns + ["success"] * with_success, cells)
 
 
 @click.command()

@@ -160,10 +160,8 @@ def build(
       tcmrl-data build point-robot --profile quick
       tcmrl-data build half-cheetah-vel --plan --workers 8
       tcmrl-data build point-robot --recipe
-      tcmrl-data build half-cheetah-vel --tasks 0-9 --out data/cheetah
       tcmrl-data build ml1/reach --set rollouts.episodes=20
       tcmrl-data build point-robot --drop-tasks 6
-      tcmrl-data build my-recipe.toml --profile quick
       tcmrl-data build point-robot --expect-root s3://bucket/point-robot
     """
     import tcmrl_data

@@ -1,15 +1,16 @@
 """`tcmrl-data inspect quality|coverage|rewards|transfer|worth`: measures of a dataset."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import click
 
 from .frame import (
     number,
     output_options,
+    print_by_step,
     print_json,
     print_rows,
     remark,
@@ -26,20 +27,10 @@ if TYPE_CHECKING:
     from tcmrl_data.quality.scores import StageQuality
 
 Found = TypeVar("Found", bound="Measured")
-Row = TypeVar("Row", bound="Stage")
 Report = Callable[[str], PartsProgress]
 """Takes the name of a stage and gives what reports its progress."""
 
 UNITS = {"reading": "parts", "playing": "episodes"}
-
-
-class Stage(Protocol):
-    """A row of a measure by step and split."""
-
-    @property
-    def step(self) -> int: ...
-    @property
-    def split(self) -> str: ...
 
 
 def run_measure(
@@ -80,22 +71,6 @@ def run_measure(
 def title(found: "Measured") -> str:
     """What tables call the dataset."""
     return found.label or found.environment
-
-
-def _print_stages(
-    heading: str,
-    columns: Sequence[str],
-    stages: Sequence[Row],
-    cells: Callable[[Row], Iterable[str]],
-    *,
-    long_text: Sequence[str] = (),
-) -> None:
-    """Prints a table of cells by step and split; a step that the row before has too is left out."""
-    rows = []
-    for place, stage in enumerate(stages):
-        is_repeated = place > 0 and stages[place - 1].step == stage.step
-        rows.append(("" if is_repeated else f"{stage.step:,}", stage.split, *cells(stage)))
-    print_rows(heading, ["step", "split", *columns], rows, text=["split"], long_text=long_text)
 
 
 TIERS_SHOWN: tuple["Tier", ...] = ("random", "medium", "expert")
@@ -189,17 +164,17 @@ def rewards(dataset: Path, as_json: bool, plot: Path | None) -> None:
 
 
 def _print_quality(found: "Quality") -> None:
-    def cells(stage: "StageQuality") -> Iterator[str]:
+    rows = []
+    for stage in found.stages:
         tq = stage.tq
         values = [None] * 4 if tq is None else [tq.mean, tq.iqm, tq.min, tq.max]
         mean, iqm, least, most = map(number, values)
         low, high = (None, None) if tq is None else (tq.low, tq.high)
         interval = "–" if low is None else f"{number(low)} to {number(high)}"
-        yield from (f"{stage.parts:,}", mean, iqm, interval, least, most, _tiers(found, stage))
-
+        cells = (f"{stage.parts:,}", mean, iqm, interval, least, most, _tiers(found, stage))
+        rows.append((stage.step, stage.split, *cells))
     columns = ["parts", "TQ", "IQM", "95%", "min", "max", "tiers"]
-    heading = f"{title(found)}: trajectory quality of snapshots"
-    _print_stages(heading, columns, found.stages, cells, long_text=["tiers"])
+    print_by_step(f"{title(found)}: trajectory quality of snapshots", columns, rows, long_text=["tiers"])
 
 
 def _tiers(found: "Quality", stage: "StageQuality") -> str:
@@ -216,18 +191,14 @@ def _tiers(found: "Quality", stage: "StageQuality") -> str:
 
 
 def _print_coverage(found: "Coverage") -> None:
-    _print_stages(
-        f"{title(found)}: means over parts",
-        ["parts", "steps", "cells", "SACo", "TQ"],
-        found.stages,
-        lambda stage: (
-            f"{stage.parts:,}",
-            f"{stage.steps:,.0f}",
-            f"{stage.cells:,.0f}",
-            number(stage.saco),
-            number(stage.tq),
-        ),
-    )
+    shown = [
+        (
+            *(stage.step, stage.split, f"{stage.parts:,}", f"{stage.steps:,.0f}", f"{stage.cells:,.0f}"),
+            *map(number, (stage.saco, stage.tq)),
+        )
+        for stage in found.stages
+    ]
+    print_by_step(f"{title(found)}: means over parts", ["parts", "steps", "cells", "SACo", "TQ"], shown)
     rows, tasks = found.overlap.shares, len(found.overlap.tasks)
     if tasks > 1:
         mean = (sum(map(sum, rows)) - tasks) / (tasks * (tasks - 1))
@@ -235,18 +206,16 @@ def _print_coverage(found: "Coverage") -> None:
 
 
 def _print_rewards(found: "Rewards") -> None:
-    _print_stages(
-        f"{title(found)}: stored rewards",
-        ["parts", "steps", "zero", "silent episodes", "mean", "min", "max"],
-        found.stages,
-        lambda stage: (
-            f"{stage.parts:,}",
-            f"{stage.steps:,}",
-            f"{stage.zero:.1%}",
-            f"{stage.silent:.1%}",
+    rows = [
+        (
+            *(stage.step, stage.split, f"{stage.parts:,}", f"{stage.steps:,}"),
+            *(f"{stage.zero:.1%}", f"{stage.silent:.1%}"),
             *map(number, (stage.mean, stage.min, stage.max)),
-        ),
-    )
+        )
+        for stage in found.stages
+    ]
+    columns = ["parts", "steps", "zero", "silent episodes", "mean", "min", "max"]
+    print_by_step(f"{title(found)}: stored rewards", columns, rows)
 
 
 MAX_TASKS = click.option(
@@ -394,17 +363,15 @@ def _print_worth(found: "Worth") -> None:
             "A worth above 100%: the best known returns are those of stored policies, and own policies now "
             "gained more over the best single one than the range from uniform actions to them."
         )
-    _print_stages(
-        "visibility of the task, by snapshot",
-        ["tasks", "rewarded", "in rewards", "in dynamics"],
-        found.stages,
-        lambda stage: (
-            str(stage.tasks),
-            f"{stage.rewarded:.1%}",
-            number(stage.reward),
-            number(stage.dynamics),
-        ),
-    )
+    shown = [
+        (
+            *(stage.step, stage.split, str(stage.tasks), f"{stage.rewarded:.1%}"),
+            *map(number, (stage.reward, stage.dynamics)),
+        )
+        for stage in found.stages
+    ]
+    columns = ["tasks", "rewarded", "in rewards", "in dynamics"]
+    print_by_step("visibility of the task, by snapshot", columns, shown)
     click.echo(f"The best single policy is that of task {found.single_task}.")
     _print_left_out(found)
 

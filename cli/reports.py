@@ -62,7 +62,6 @@ def report(
     Examples:
       tcmrl report results/perspectives
       tcmrl report results/perspectives results/window_length --out both
-      tcmrl report results/perspectives --dataset /disk/point-robot
       tcmrl report results/perspectives --rows results/runs.csv
       tcmrl report tuning/point-robot-tcmrl --rows results/tuning.csv
       tcmrl report results/runs.csv

@@ -121,16 +121,6 @@ def test_there_is_one_belief_more_than_steps_and_it_begins_with_the_prior() -> N
     torch.testing.assert_close(beliefs.context[:, 0], start.expand(3, -1))
 
 
-def test_beliefs_do_not_depend_on_later_steps() -> None:
-    made, lanes = learner(), joined_episodes(batch()["episodes"], 2)
-    plain = made.beliefs(lanes)[1].context
-    changed = lanes.rewards.clone()
-    changed[..., 4:] += 1.0
-    other = made.beliefs(replace(lanes, rewards=changed))[1].context
-    torch.testing.assert_close(other[:, :5], plain[:, :5])
-    assert (other[:, 5] - plain[:, 5]).abs().min() > 0
-
-
 def test_filtering_step_by_step_equals_one_pass_and_goes_on_behind_an_episode() -> None:
     made, first, second = learner(), trajectory(4, 0), trajectory(6, 1)
     lanes = joined_episodes(pad_trajectories([[first, second]], problem()), 2)
@@ -175,15 +165,6 @@ def transition(episode: Trajectory, t: int) -> LaneTransition:
         ended,
         np.ones(1, dtype=bool),
     )
-
-
-def test_the_belief_after_the_first_episode_of_a_lane_is_the_one_after_that_episode_alone() -> None:
-    made = learner()
-    first, second = trajectory(4, 0), trajectory(6, 1)
-    lanes = joined_episodes(pad_trajectories([[first, second]], problem()), 2)
-    along = made.beliefs(lanes)[1].context[0]
-    alone = made.context(pad_trajectories([[first]], problem()))[0]
-    torch.testing.assert_close(along[4], alone)
 
 
 def test_only_the_first_episodes_are_filtered_as_many_as_in_training() -> None:

@@ -29,7 +29,6 @@ from tests.made_up import (
     problem,
     random,
     settings,
-    with_steps,
 )
 from tests.small_training import small_batches
 
@@ -227,23 +226,6 @@ def test_the_loss_of_the_vae_is_the_error_of_outcomes_and_the_weighed_divergence
     expected = outcome_error(predicted, rows[:, STATE_ACTION:]) + 0.3 * divergence
     torch.testing.assert_close(found.total, expected)
     assert gradients(maker, found.total, PARTS)["cvae"] > 1e-6
-
-
-def test_the_vae_learns_outcomes_that_tasks_disagree_about() -> None:
-    """One state and action, rewards -1, 0 and 1 by task: the decoder makes all of them."""
-    algorithm = algorithm_of("corro", SMALL | {"cvae_share": 0.9, "encoder_share": 0.05, "kl_weight": 0.02})
-    maker = algorithm.learner
-    assert isinstance(maker, CorroLearner)
-    plain = batch_of("cvae")
-    steps, offset = plain["transitions"], torch.arange(TASKS).view(TASKS, 1, 1) - 1.0
-    same = {name: torch.zeros_like(getattr(steps, name)) for name in ("observations", "next_observations")}
-    steps = replace(steps, actions=0 * steps.actions, rewards=0 * steps.rewards + offset, **same)
-    for step in range(1, 91):
-        algorithm.update(with_steps(plain, transitions=steps), step)
-    made_up = maker.negatives(torch.zeros(50, STATE_ACTION + 4), torch.Generator().manual_seed(0))
-    rewards = made_up[..., STATE_ACTION]
-    assert rewards.min() < -0.6 and rewards.max() > 0.6
-    assert rewards.mean().abs() < 0.3
 
 
 def test_representations_have_length_one() -> None:

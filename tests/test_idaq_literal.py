@@ -9,7 +9,7 @@ from torch import Tensor, tensor
 
 from tcmrl_algo import PROTOCOLS, Adaptation, Arena
 from tcmrl_algo.evaluation.protocols.idaq import farthest
-from tcmrl_data import Controller, Dataset, Trajectory, UniformController
+from tcmrl_data import Dataset, Trajectory
 from tests.adapters import GoalReader, arena, goal_of
 
 
@@ -104,31 +104,6 @@ class WithLatents(GoalReader):
 
     def latents(self, trajectories: Sequence[Sequence[Trajectory]]) -> Tensor:
         return tensor(np.array([goal_of(lane[0]) for lane in trajectories]))
-
-
-class Roaming(WithLatents):
-    """Ignores its context; records the goals that it is asked to walk to."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.goals: list[np.ndarray] = []
-
-    def adapt(
-        self, trajectories: Sequence[Sequence[Trajectory]], *, privileged: Tensor | None = None
-    ) -> Controller:
-        self.goals.append(np.array([goal_of(lane[0]) for lane in trajectories]))
-        return UniformController()
-
-
-def test_every_lane_draws_its_own_candidates_and_spreads_its_tries(tiny: Dataset) -> None:
-    method = Roaming()
-    lanes = [*tiny.test_tasks] * 12
-    place = arena(tiny, method, episodes=3, random_episodes=3, candidates=40)
-    PROTOCOLS.get("idaq_literal")().adapt(place, lanes)
-    tried = np.stack(method.goals[:2])  # (episodes, lanes, 2)
-    assert len({tuple(goal) for goal in tried[0]}) > 1  # the first is drawn, and so differs between lanes
-    spread = np.linalg.norm(tried[1] - tried[0], axis=-1)
-    assert spread.min() > 0.5  # 40 draws hold all four training goals: the farthest is never near
 
 
 def test_drawn_candidates_are_training_tasks_and_repeat_exactly(tiny: Dataset) -> None:

@@ -34,9 +34,6 @@ from tcmrl_algo.algorithms.tcmrl_variants import (
 )
 from tests.made_up import random
 
-YES = torch.tensor([[True, True]])
-
-
 MASK = torch.tensor([[True, True, True], [True, True, False]])
 FULL = torch.ones(2, 3, dtype=torch.bool)
 NOISE = random(2, 3, seed=9).detach()

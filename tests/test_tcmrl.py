@@ -185,21 +185,6 @@ def test_literal_equation_6_adds_nothing_to_any_gradient() -> None:
     assert max(grad.abs().max() for grad in grads) < 1e-7
 
 
-@pytest.mark.parametrize("kind", ["sigmoid", "centered", "entropy"])
-def test_only_the_sigmoid_sparsity_can_be_lowered_by_the_last_bias(kind: str) -> None:
-    """The bias shifts all scores alike, which the softmax does not see."""
-    made = learner({"sparsity": kind, "weights": ONLY | {"sparsity": 1.0}})
-    before = losses_of(made)
-    with torch.no_grad():
-        list(made.extractor.parameters())[-1].sub_(5.0)
-    after = losses_of(made)
-    torch.testing.assert_close(after.context, before.context)
-    unchanged = after.total.item() == pytest.approx(before.total.item(), rel=1e-4)
-    assert unchanged is (kind != "sigmoid")
-    if kind == "sigmoid":
-        assert after.total.item() < 0.1 * before.total.item()
-
-
 def test_negative_estimation_with_noise_of_mean_zero_fits_the_true_rewards() -> None:
     """Over noise e and -e the gradient of L_neg is that of no noise, exactly, as is then its expectation."""
 
