@@ -58,7 +58,7 @@ def push(
     Examples:
       tcmrl-data push data/point-robot s3://bucket/point-robot
       tcmrl-data push data/point-robot-medium s3://bucket/point-robot --tag medium
-      tcmrl-data push data/point-robot s3://bucket/point-robot --plan --price-per-gb 0.023
+      tcmrl-data push data/point-robot s3://bucket/pr --plan --price-per-gb 0.023
     """
     import tcmrl_data
 

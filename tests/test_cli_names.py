@@ -63,6 +63,8 @@ MEANINGS = {
     "--out": "where to write",
     "--plan": "only say what the work takes",
     "--plot": "a picture to draw",
+    "--price-per-1000-requests": "what 1,000 requests to a store cost",
+    "--price-per-gb": "what a gigabyte in a store costs",
     "--profile": "a profile of the recipe",
     "--protocol": "a protocol of adaptation",
     "--quick": "check names and sizes alone",
