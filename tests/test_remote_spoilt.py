@@ -108,7 +108,8 @@ def test_a_spoilt_object_is_retried_or_named(
             opened.fetch()
             assert opened.manifest.root == root
             continue
-        if request[1].endswith(".zip") and flaw != "delay":
+        # a swapped answer may be longer, which is not asked for again, or equal
+        if request[1].endswith(".zip") and flaw not in ("delay", "swap"):
             assert how == ("named" if always else "retried"), (verb, request, error)
         if error:
             assert not (out / MANIFEST).exists()
