@@ -5,6 +5,7 @@ import re
 import shlex
 import tomllib
 from collections.abc import Iterator
+from itertools import dropwhile
 from pathlib import Path
 
 import click
@@ -103,7 +104,7 @@ def check(words: tuple[str, ...]) -> None:
         ClickException: the program does not take it.
         AssertionError: it names a target or a file that is not there.
     """
-    program, *rest = words
+    program, *rest = dropwhile(re.compile("[A-Z_]+=").match, words)  # without variables of the environment
     if program in PROGRAMS:
         parse(PROGRAMS[program], rest)
     elif program == "make":
