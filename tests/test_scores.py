@@ -7,7 +7,7 @@ from tcmrl_algo.experiment.results import RunResult, success_rate
 from tcmrl_algo.experiment.spec import run_id
 from tcmrl_algo.report.sources import read_sources
 from tcmrl_algo.report.statistics import over_dataset
-from tcmrl_algo.report.tables import final_table, published_table
+from tcmrl_algo.report.tables import final_table
 from tests import experiments
 from tests.experiments import made_result, write_results
 
@@ -15,7 +15,7 @@ from tests.experiments import made_result, write_results
 def test_missing_runs_are_counted_by_method_or_environment_and_failed_ones_named(tmp_path: Path) -> None:
     content = experiments.tables(tmp_path, claims=[], methods={"A": {"algorithm": "tcmrl"}}, seeds=[0])
     folder = write_results(tmp_path / "one", content, [made_result("A", 0, 1.0)])
-    (source,) = read_sources([folder], None)
+    (source,) = read_sources([folder])
     runs = [("point-robot", "B", 1), ("point-robot", "B", 2), ("ml1/reach", "A", 0), ("ml1/reach", "B", 0)]
     unfinished = {run_id(*run): None for run in runs} | {run_id("point-robot", "A", 1): "diverged"}
     assert replace(source, unfinished=unfinished).missing == [
@@ -38,14 +38,6 @@ def test_success_rates_and_returns_over_the_datasets_have_columns_where_known() 
     assert over_dataset({"mean_final": 1.0}, None) is None
     never = _with_success(plain, 0.0)
     assert "success" in final_table("x", [never]).columns
-
-
-def test_focal_by_the_literal_protocol_stands_for_idaq() -> None:
-    focal = made_result("FOCAL", final=-7.0, protocols=("offline", "idaq_literal"), algorithm="focal")
-    table = published_table("x", "point-robot-wind", [focal])
-    assert table is not None
-    rows = {row[0]: dict(zip(table.columns, row, strict=True)) for row in table.rows}
-    assert rows["IDAQ"]["ours, idaq_literal"] == -7.0 and rows["IDAQ"]["ours, offline"] is None
 
 
 def _with_success(run: RunResult, *shares: float | None) -> RunResult:

@@ -128,8 +128,8 @@ def derived_problems(
     """
     keys = {entry.id: entry.key for entry in table.entries()}
     for entry in table.entries():
-        file, run = part_file(entry.key), runs[entry.run]
-        if run.recipe is None or run.kind == "built" or file not in only:
+        file, run = part_file(entry.key), runs.get(entry.run)
+        if run is None or run.recipe is None or run.kind == "built" or file not in only:
             continue
         with contextlib.ExitStack() as stack:
             archive = stack.enter_context(Archive(folder / file))
