@@ -1,6 +1,6 @@
 """Measures how long training from a bucket waits for data, beside training from a folder. Prints JSON.
 
-`python benchmarks/remote_waiting.py DATASET [--steps N] [--memory-limit SIZE] [--server moto|seaweedfs]`
+`PYTHONPATH=. python benchmarks/remote_waiting.py DATASET [--steps N] [--memory-limit SIZE] [--server NAME]`
 
 DATASET is pushed to an S3 server on the loopback, a process of its own, and `tcmrl train s3://…` runs with
 an empty cache; then the same from the folder, with another empty cache. All parts of a run are fetched and

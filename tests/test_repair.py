@@ -5,10 +5,8 @@ import json
 import os
 import resource
 import shutil
-import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
 
 import pytest
 from tcmrl_cli.data import data
@@ -32,6 +30,7 @@ from tcmrl_data.store.tables import PARTS, TASKS, PartKey, part_file, seal_of
 from tcmrl_data.verification import repair
 from tests.commands import in_process
 from tests.damage import data_files, found, ids_of, rot
+from tests.hostile.bounds import ringing
 
 pytestmark = pytest.mark.usefixtures("module_in_process")
 
@@ -113,19 +112,12 @@ def test_a_part_and_its_table_damaged_together_are_repaired(tiny_copy: Copy, tin
 @contextlib.contextmanager
 def limits(*, seconds: int, file_bytes: int) -> Iterator[None]:
     """Fails what writes a larger file, here or in a worker, or takes longer."""
-
-    def ring(number: int, frame: FrameType | None) -> None:
-        raise AssertionError(f"blocked for {seconds} s")
-
-    old = signal.signal(signal.SIGALRM, ring)
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (file_bytes, before[1]))
-    signal.alarm(seconds)
     try:
-        yield
+        with ringing(seconds):
+            yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, old)
         resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 

@@ -23,8 +23,20 @@ def resident_bytes(field: str) -> int:
     return int(line.split()[1]) * 1024
 
 
-def _ring(number: int, frame: FrameType | None) -> None:
-    raise AssertionError(f"blocked for {SECONDS} s")
+@contextlib.contextmanager
+def ringing(seconds: int) -> Iterator[None]:
+    """Fails what takes longer."""
+
+    def ring(number: int, frame: FrameType | None) -> None:
+        raise AssertionError(f"blocked for {seconds} s")
+
+    old = signal.signal(signal.SIGALRM, ring)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, old)
 
 
 @contextlib.contextmanager
@@ -33,13 +45,11 @@ def bounded(num_bytes: int, *, ratio: int) -> Iterator[None]:
     gc.collect()
     Path("/proc/self/clear_refs").write_text("5")  # resets the peak of resident memory
     resident = resident_bytes("VmRSS")
-    old, limits = signal.signal(signal.SIGALRM, _ring), resource.getrlimit(resource.RLIMIT_AS)
+    limits = resource.getrlimit(resource.RLIMIT_AS)
     resource.setrlimit(resource.RLIMIT_AS, (resident_bytes("VmSize") + ADDRESS_SPACE, limits[1]))
-    signal.alarm(SECONDS)
     try:
-        yield
+        with ringing(SECONDS):
+            yield
     finally:
-        signal.alarm(0)
-        signal.signal(signal.SIGALRM, old)
         resource.setrlimit(resource.RLIMIT_AS, limits)
     assert resident_bytes("VmHWM") - resident <= MEMORY_FLOOR + ratio * num_bytes
