@@ -7,6 +7,8 @@
 # make docs   the documentation as a site, in build/docs
 # make results   results/README.md from the tables beside it
 PYTHON ?= python3
+# Where torch's build without CUDA lies; `make TORCH_INDEX= demo` takes PyPI's, for a GPU.
+TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 SEED ?= 0
 JOBS ?= 2
 DATA ?= data/demo
@@ -14,6 +16,7 @@ RUN ?= runs/demo
 VENV := .venv
 BIN := $(VENV)/bin
 EXTRAS := docs,minari,parquet,ray,remote,report,tensordict,test,tune
+TORCH := torch==2.13.0 $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 INSTALLED := $(VENV)/.installed
 INSTALLED_TEST := $(VENV)/.installed-test
 INSTALLED_DOCS := $(VENV)/.installed-docs
@@ -34,7 +37,8 @@ $(BIN)/python:
 	$(PYTHON) -m venv $(VENV)
 
 $(INSTALLED): pyproject.toml constraints.txt | $(BIN)/python
-	$(BIN)/python -m pip install --quiet -c constraints.txt torch==2.13.0
+	@echo "installing torch (200 MB) and the other packages into $(VENV)"
+	$(BIN)/python -m pip install --quiet -c constraints.txt $(TORCH)
 	$(BIN)/python -m pip install --quiet -c constraints.txt --editable '.[report]'
 	@touch $@
 
@@ -77,7 +81,7 @@ packages: $(INSTALLED)
 
 constraints:
 	$(PYTHON) -m venv --clear build/constraints
-	build/constraints/bin/pip install --quiet torch==2.13.0
+	build/constraints/bin/pip install --quiet $(TORCH)
 	build/constraints/bin/pip install --quiet '.[benchmark,$(EXTRAS)]'
 	(head -n 2 constraints.txt; build/constraints/bin/pip freeze --all --exclude pip --exclude tcmrl | sed 's/+cpu$$//') > build/constraints/new
 	mv build/constraints/new constraints.txt

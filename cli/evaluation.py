@@ -176,6 +176,8 @@ def evaluate(
         return
     for table in score_tables(results):
         print_table(table)
+    if plot is not None:
+        remark(f"picture written to {plot}")
     notes = [
         FIXED,
         BEHAVIOR,

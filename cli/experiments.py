@@ -64,8 +64,7 @@ def _shipped_names() -> list[str]:
 @click.option(
     "--data",
     type=PATH,
-    default=Path("data"),
-    show_default=True,
+    show_default="the file's, else data",
     metavar="FOLDER",
     help="Folder that contains a dataset per environment, under its name; or one dataset.",
 )
@@ -102,7 +101,7 @@ def experiment(
     name: str | None,
     as_list: bool,
     out: Path | None,
-    data: Path,
+    data: Path | None,
     workers: int | None,
     steps: int | None,
     seeds: str | None,
@@ -181,7 +180,9 @@ def experiment(
         fail_incomplete(f"{report.failed[0]}{more}; run the same command again to repeat the failed runs")
 
 
-def _build(loaded: "Experiment", environments: tuple[str, ...], *, data: Path, workers: int | None) -> None:
+def _build(
+    loaded: "Experiment", environments: tuple[str, ...], *, data: Path | None, workers: int | None
+) -> None:
     """Builds the datasets that the experiment lacks, one after another."""
     from tcmrl_algo import build_missing, missing_datasets
 

@@ -91,7 +91,8 @@ def test_a_method_is_complete_and_its_settings_are_documented(name: str) -> None
     assert not inspect.signature(method).parameters
     assert method.Config.model_config.get("frozen") and method.Config.model_config.get("extra") == "forbid"
     for field in method.Config.model_fields:
-        assert f"{field}:" in (method.Config.__doc__ or ""), field
+        documented = f"{field}:" in (method.Config.__doc__ or "")
+        assert documented, f"no {field!r} under `Attributes:` in the docstring of {method.Config.__name__}"
 
 
 @every

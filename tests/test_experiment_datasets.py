@@ -68,19 +68,26 @@ def test_a_dataset_of_another_profile_is_used_only_if_it_is_named_itself(
     assert len(plan_runs(experiment, data=tiny_folder, out=tiny_folder)) == 4
 
 
+def test_a_folder_that_is_given_goes_before_what_the_file_names(tiny_folder: Path, tmp_path: Path) -> None:
+    experiment = _small(tiny_folder)
+    assert len(plan_runs(experiment, data=None, out=tmp_path)) == 4
+    with pytest.raises(SelectionError, match=f"no dataset at {tmp_path / 'point-robot'}"):
+        plan_runs(experiment, data=tmp_path, out=tmp_path)
+
+
 def test_only_chosen_environments_are_run(tiny_folder: Path, call: Call) -> None:
     content = experiments.tables(tiny_folder)
     content["environments"]["half-cheetah-vel"] = {"dataset": "nowhere"}
     experiment = read_experiment(content, place="test")
-    runs = plan_runs(experiment, data=tiny_folder.parent, out=tiny_folder, environments=["point-robot"])
+    runs = plan_runs(experiment, data=None, out=tiny_folder, environments=["point-robot"])
     assert {run.environment for run in runs} == {"point-robot"}
     with pytest.raises(TrainingError, match=r"'point-robt'.*'half-cheetah-vel'"):
-        plan_runs(experiment, data=tiny_folder.parent, out=tiny_folder, environments=["point-robt"])
+        plan_runs(experiment, data=None, out=tiny_folder, environments=["point-robt"])
 
 
 def test_folds_test_every_task_once_with_every_seed(tiny_folder: Path, tmp_path: Path) -> None:
     experiment = _small(tiny_folder, folds=2, seeds=[3])
-    runs = plan_runs(experiment, data=tmp_path, out=tmp_path)
+    runs = plan_runs(experiment, data=None, out=tmp_path)
     assert [(run.method, run.seed, run.fold) for run in runs] == [
         ("TCMRL", 3, 0),
         ("no context", 3, 0),
@@ -94,10 +101,10 @@ def test_folds_test_every_task_once_with_every_seed(tiny_folder: Path, tmp_path:
     ]
     assert not tested[0] & tested[1]
     assert tested[0] | tested[1] == {task.index for task in tcmrl_data.open_dataset(tiny_folder).tasks}
-    again = plan_runs(experiment, data=tmp_path, out=tmp_path)
+    again = plan_runs(experiment, data=None, out=tmp_path)
     assert [run.identity for run in again] == [run.identity for run in runs]
     with pytest.raises(SelectionError, match="5 tasks do not make 6 folds"):
-        plan_runs(_small(tiny_folder, folds=6), data=tmp_path, out=tmp_path)
+        plan_runs(_small(tiny_folder, folds=6), data=None, out=tmp_path)
 
 
 @pytest.mark.check

@@ -16,18 +16,21 @@ from matplotlib.figure import Figure
 from tcmrl_cli import making
 from tcmrl_cli.frame import footnotes
 from tcmrl_cli.train import tcmrl
+from torch import Generator, Tensor
 
 import tcmrl_data
-from tcmrl_algo import train_run
+from tcmrl_algo import ContextAlgorithm, resume_run, train_run
+from tcmrl_algo.algorithms.core.context import ContextLearner, ContextLosses
 from tcmrl_algo.algorithms.core.settings import RunSettings
 from tcmrl_algo.evaluation.evaluate import draw_paths
-from tcmrl_data import BuildReport, Dataset, list_datasets, open_dataset
+from tcmrl_data import Batch, BuildReport, Dataset, Steps, list_datasets, open_dataset
 from tcmrl_data.foundation.disk import disk, named_errors
-from tcmrl_data.foundation.errors import BuildError, SelectionError, StorageError
+from tcmrl_data.foundation.errors import BuildError, SelectionError, StorageError, TrainingError
 from tests.commands import Call, assert_refused, in_process
 from tests.graded import graded_dataset, graded_recipe
 from tests.small_training import config_of
 from tests.terminal import as_in_terminal
+from tests.test_algorithms import Made
 
 Copy = Callable[[], Path]
 
@@ -109,8 +112,41 @@ def test_an_interrupted_run_is_evaluated_with_a_remark(
     call = in_process(tcmrl, capsys)
     remark = "This run was interrupted: it has 5 of 9 steps."
     for folder, is_said in (("part", True), ("whole", False)):
-        code, _, errors = call("evaluate", tmp_path / folder, "--protocol", "offline")
+        picture = tmp_path / f"{folder}.png"
+        code, _, errors = call("evaluate", tmp_path / folder, "--protocol", "offline", "--plot", picture)
         assert (code, remark in errors) == (0, is_said), errors
+        assert f"picture written to {picture}" in errors.replace("\n", "") and picture.exists()
+
+
+def test_a_finished_run_says_so_instead_of_going_on(tiny: Dataset, tmp_path: Path) -> None:
+    config, said = config_of(tiny, "run.steps=5"), list[str]()
+    first = train_run(tiny, tmp_path / "run", config=config, profile="quick")
+    assert resume_run(tmp_path / "run", tiny, say=said.append).digest == first.digest
+    assert len(said) == 1 and "has all of its 5 steps" in said[0] and "--out" in said[0]
+
+
+class OtherSize(ContextLearner):
+    """A mistake that is easily made: the context's size is not the one that is declared."""
+
+    def __init__(self, learner: ContextLearner) -> None:
+        super().__init__()
+        self.learner, self.latent = learner, learner.latent + 1
+
+    def losses(self, batch: Batch, step: int, generator: Generator) -> ContextLosses:
+        return self.learner.losses(batch, step, generator)
+
+    def context(self, steps: Steps) -> Tensor:
+        return self.learner.context(steps)
+
+
+def test_contexts_of_a_wrong_shape_are_named_with_what_is_expected() -> None:
+    made = Made("focal")
+    assert isinstance(made.algorithm, ContextAlgorithm)
+    made.algorithm.learner = OtherSize(made.algorithm.learner)
+    tasks, latent = len(made.batch(1).task_indices), made.algorithm.learner.latent
+    expected = f"OtherSize.losses returned contexts of shape {(tasks, latent - 1)}; one per task is "
+    with pytest.raises(TrainingError, match=re.escape(expected + f"{(tasks, latent)}")):
+        made.train(1, 1)
 
 
 def test_a_build_that_made_nothing_has_no_root(

@@ -33,11 +33,12 @@ class MissingDataset:
         return f"tcmrl-data build {self.environment} --profile {self.profile} --out {self.folder}"
 
 
-def missing_datasets(experiment: Experiment, data: Path) -> list[MissingDataset]:
+def missing_datasets(experiment: Experiment, data: Path | None = None) -> list[MissingDataset]:
     """The datasets of an experiment that do not exist.
 
     Args:
-        data: folder of datasets, one per environment; or one dataset.
+        data: folder of datasets, one per environment; or one dataset. If left out, the datasets that the
+            experiment's file names, else those in `data`.
     """
     return [
         MissingDataset(environment, folder, _profile_to_build(choice))
@@ -56,7 +57,7 @@ def build_missing(
         raise TrainingError(f"{missing.folder}: {built.failed[0]}; build it with `{missing.command}`")
 
 
-def open_datasets(experiment: Experiment, data: Path) -> dict[str, Dataset]:
+def open_datasets(experiment: Experiment, data: Path | None = None) -> dict[str, Dataset]:
     """The dataset of every environment.
 
     Raises:
@@ -93,10 +94,10 @@ def fold_datasets(dataset: Dataset, views: Path, folds: int | None) -> dict[int 
     return {fold: open_dataset(view.out) for fold, view in enumerate(made)}
 
 
-def _folder(environment: str, choice: EnvironmentChoice, data: Path) -> Path:
-    if _is_dataset(data):
-        return data
-    return Path(choice.dataset) if choice.dataset else data / environment
+def _folder(environment: str, choice: EnvironmentChoice, data: Path | None) -> Path:
+    if data is None:
+        return Path(choice.dataset or f"data/{environment}")
+    return data if _is_dataset(data) else data / environment
 
 
 def _is_dataset(path: Path) -> bool:
@@ -113,7 +114,7 @@ def _profile_to_build(choice: EnvironmentChoice) -> Profile:
     return "paper"
 
 
-def _opened(environment: str, choice: EnvironmentChoice, data: Path) -> Dataset:
+def _opened(environment: str, choice: EnvironmentChoice, data: Path | None) -> Dataset:
     folder = _folder(environment, choice, data)
     dataset = open_dataset(folder)
     if dataset.name != environment:

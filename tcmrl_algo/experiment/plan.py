@@ -22,7 +22,7 @@ from tcmrl_data.foundation.records import leaves
 def plan_runs(
     experiment: Experiment,
     *,
-    data: Path,
+    data: Path | None,
     out: Path,
     environments: Sequence[str] = (),
     seeds: Sequence[int] | None = None,
@@ -35,7 +35,7 @@ def plan_runs(
     """Every run, all methods under one seed before the next seed.
 
     Args:
-        data: folder of datasets, one per environment; or one dataset, whatever the file says of its place.
+        data: as for `run_experiment`.
         out: the results folder. View files of folds are written there, after all else was checked.
         environments: instead of all of the experiment's.
         seeds: instead of the experiment's.

@@ -59,7 +59,7 @@ def run_experiment(
     experiment: Experiment,
     out: str | Path,
     *,
-    data: str | Path = "data",
+    data: str | Path | None = None,
     only: Sequence[str] = (),
     environments: Sequence[str] = (),
     seeds: Sequence[int] | None = None,
@@ -75,7 +75,8 @@ def run_experiment(
 
     Args:
         out: the results folder; a second call goes on in it.
-        data: folder of datasets, one per environment; or one dataset.
+        data: folder of datasets, one per environment; or one dataset. If left out, the datasets that the
+            experiment's file names, else those in `data`.
         only: labels of methods; all where empty.
         environments: names of environments; all where empty.
         seeds: instead of the experiment's.
@@ -110,7 +111,8 @@ def run_experiment(
             for name, settings in tuned.items()
         },
     }
-    datasets = open_datasets(experiment.on(environments), Path(data))
+    data = None if data is None else Path(data)
+    datasets = open_datasets(experiment.on(environments), data)
     call["roots"] = {name: dataset.manifest.root for name, dataset in datasets.items()}
     if (names := _nothing_to_do(out, call)) is not None:
         results = tuple(read_result(out / "runs" / name) for name in names)
@@ -123,7 +125,7 @@ def run_experiment(
     workers = workers or cores
     every = plan_runs(
         experiment,
-        data=Path(data),
+        data=data,
         out=out,
         environments=environments,
         seeds=seeds,

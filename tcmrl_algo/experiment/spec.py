@@ -41,7 +41,7 @@ class EnvironmentChoice(Frozen):
     """One `[environments.NAME]` table.
 
     Attributes:
-        dataset: its folder; `NAME` below the folder of datasets where unset.
+        dataset: its folder, unless another is given; `data/NAME` where unset.
         dataset_profile: the profile that its dataset is built with; any where unset.
         profile: whose training table to start from; the one the dataset was built with where unset.
         training: changes of that table, also of settings that were tuned.

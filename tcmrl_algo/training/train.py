@@ -296,7 +296,10 @@ def resume_run(
         say=say,
     )
     algorithm = create_algorithm(record, dataset)
-    say(f"going on from step {start:,}" if start else "no checkpoint was saved: starting at step 0")
+    if start == record.steps:
+        say(f"{out} has all of its {start:,} steps; to train with other settings, name another --out")
+    else:
+        say(f"going on from step {start:,}" if start else "no checkpoint was saved: starting at step 0")
     if start:
         algorithm.load_tensors(run.newest().tensors())
     run = write_run(run.folder, record)

@@ -28,6 +28,7 @@ from tcmrl_data import (
     Transitions,
     UniformController,
 )
+from tcmrl_data.foundation.errors import TrainingError
 
 ACTOR_CRITIC_STREAM = 1
 """Of random draws: apart from the learner's, so that no switch of a method changes the actor-critic's."""
@@ -252,6 +253,12 @@ class ContextAlgorithm(Algorithm):
         self._trains_policy = found.context is not None
         if found.context is None:
             return found.total, found.metrics
+        tasks, latent, shape = len(batch.task_indices), self.learner.latent, tuple(found.context.shape)
+        if len(shape) < 2 or (shape[0], shape[-1]) != (tasks, latent):
+            raise TrainingError(
+                f"{type(self.learner).__name__}.losses returned contexts of shape {shape}; one per task is "
+                f"{(tasks, latent)}, one per step ({tasks}, …, {latent})"
+            )
         generator = self.problem.generator(step, ACTOR_CRITIC_STREAM)
         rows = self.actor_critic.rows(
             batch["policy"] if found.steps is None else found.steps,
