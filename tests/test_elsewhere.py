@@ -102,7 +102,7 @@ def environment(folder: Path, place: Path, packages: Sequence[str], *, borrowed:
     (site,) = (folder / "lib").glob("python*/site-packages")
     if borrowed:  # a line in a .pth file does not run the .pth files that lie there
         (site / "borrowed.pth").write_text(sysconfig.get_path("purelib"))
-    options = ["--no-deps", "--no-build-isolation"] if borrowed else []
+    options = ["--no-deps"] if borrowed else []
     command = [python, "-m", "pip", "install", "--quiet", *options, *packages]
     installed = subprocess.run(command, capture_output=True, text=True, check=False)
     assert installed.returncode == 0, installed.stderr[-2_000:]
