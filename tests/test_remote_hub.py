@@ -19,7 +19,7 @@ from tcmrl_data.foundation.errors import RemoteError
 from tcmrl_data.remote import hub
 from tcmrl_data.store.manifest import MANIFEST
 from tests.hub_stub import HubStub
-from tests.test_remote import frozen, last, own_fetched_parts, sealed_files  # noqa: F401 # fixtures
+from tests.remotes import frozen, last, own_fetched_parts, sealed_files  # noqa: F401 # fixtures
 
 URL = "hf://datasets/owner/name"
 

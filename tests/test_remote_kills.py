@@ -1,5 +1,6 @@
 """Pushes and pulls that are killed at a request, and given again: nothing is lost or doubled."""
 
+# ruff: noqa: F811 # fixtures of another file
 import os
 import shutil
 import subprocess
@@ -9,15 +10,16 @@ from pathlib import Path
 import pytest
 from _pytest.mark import ParameterSet
 
-pytest.importorskip("moto", reason="needs the extras `remote` and `test`")
+pytest.importorskip("obstore", reason="needs the extra `remote`")
+pytest.importorskip("moto", reason="needs the extra `test`")
 
 from tcmrl_data import open_dataset, verify_dataset
 from tcmrl_data.foundation.disk import STAGING
 from tcmrl_data.remote.address import parse_address
 from tcmrl_data.remote.objects import Objects
 from tcmrl_data.store.tables import part_file
-from tests.remotes import Proxy
-from tests.test_remote import (  # noqa: F401 # fixtures
+from tests.remotes import (  # noqa: F401 # fixtures
+    Proxy,
     bucket,
     frozen,
     own_fetched_parts,
@@ -40,7 +42,7 @@ def chosen(number: int, sweep: int) -> range:
     return range(number) if sweep == 1 else range(2 * number // 3, 2 * number // 3 + 1)
 
 
-def kill_at(server: Proxy, spoilt: int | None, *, answered: bool, words: list[str]) -> int:  # noqa: F811
+def kill_at(server: Proxy, spoilt: int | None, *, answered: bool, words: list[str]) -> int:
     """Runs a command, and kills it when it makes a request, or when that was answered; returns its end."""
     process = subprocess.Popen(
         [sys.executable, "-c", START, *words, "--quiet"],
@@ -66,9 +68,9 @@ def kill_at(server: Proxy, spoilt: int | None, *, answered: bool, words: list[st
 @ANSWERED
 @pytest.mark.parametrize("tag", [None, in_sweeps("v1")])
 def test_a_killed_push_goes_on(
-    bucket: str,  # noqa: F811
-    server: Proxy,  # noqa: F811
-    frozen: Path,  # noqa: F811
+    bucket: str,
+    server: Proxy,
+    frozen: Path,
     sweep: int,
     answered: bool,
     tag: str | None,
@@ -100,9 +102,9 @@ def names_at(url: str) -> set[str]:
 @ANSWERED
 @pytest.mark.parametrize("selected", [False, in_sweeps(True)], ids=["whole", "selected"])
 def test_a_killed_pull_goes_on(
-    bucket: str,  # noqa: F811
-    server: Proxy,  # noqa: F811
-    frozen: Path,  # noqa: F811
+    bucket: str,
+    server: Proxy,
+    frozen: Path,
     tmp_path: Path,
     sweep: int,
     answered: bool,

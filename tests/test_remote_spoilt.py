@@ -10,12 +10,14 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("moto", reason="needs the extras `remote` and `test`")
+pytest.importorskip("obstore", reason="needs the extra `remote`")
+pytest.importorskip("moto", reason="needs the extra `test`")
 
 from tcmrl_data import TcmrlError, open_dataset, pull_dataset, push_dataset
 from tcmrl_data.store.manifest import MANIFEST
-from tests.remotes import FLAWS, Proxy
-from tests.test_remote import (  # noqa: F401 # fixtures
+from tests.remotes import (  # noqa: F401 # fixtures
+    FLAWS,
+    Proxy,
     bucket,
     frozen,
     own_fetched_parts,
