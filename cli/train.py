@@ -191,7 +191,7 @@ def _note_source(
         source = "the method's defaults"
     else:
         return
-    progress.note(f"{dataset.folder} holds no {table} table; its values are {source}")
+    progress.note(f"{dataset.path} holds no {table} table; its values are {source}")
 
 
 def _check_given(

@@ -17,7 +17,7 @@ from tcmrl_cli.train import tcmrl
 import tcmrl_data
 from tcmrl_algo import open_run, train_run
 from tcmrl_data import open_dataset, pull_dataset, push_dataset, verify_dataset
-from tcmrl_data.foundation.errors import ManifestError, RemoteError, StoreError
+from tcmrl_data.foundation.errors import ManifestError, RemoteError, StoreError, TaskError
 from tcmrl_data.remote.address import parse_address
 from tcmrl_data.store.manifest import MANIFEST
 from tests.commands import assert_refused, in_process
@@ -97,6 +97,8 @@ def test_a_dataset_opens_with_three_requests_and_fetches_what_is_read(
     server.reset()
     open_dataset(bucket).fetch()
     assert len(server.log) == 1 + 8  # the manifest tells that the tables are in the cache
+    with pytest.raises(TaskError, match=f"{bucket} holds no task 999"):
+        opened.task(999)
 
 
 def test_a_selection_is_pulled_by_its_own_parts(
@@ -208,6 +210,20 @@ def test_a_dataset_of_the_hub_is_read(frozen: Path, tmp_path: Path, monkeypatch:
         assert sealed_files(tmp_path / "out") == sealed_files(frozen)
         with pytest.raises(RemoteError, match="holds no dataset; check its spelling"):
             open_dataset("hf://datasets/owner/name")
+
+
+@pytest.mark.parametrize(("protocol", "prefix"), [("s3", "AWS"), ("az", "AZURE")])
+def test_who_has_no_credentials_is_told_at_once(
+    protocol: str, prefix: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Machines of the two clouds give credentials to their programs; this one gives none."""
+    monkeypatch.setenv("AWS_METADATA_ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setenv("AZURE_MSI_ENDPOINT", "http://127.0.0.1:9")
+    monkeypatch.setenv("AZURE_STORAGE_ACCOUNT_NAME", "account")
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID", raising=False)
+    with pytest.raises(RemoteError, match=f"check the credentials .*set {prefix}_SKIP_SIGNATURE") as raised:
+        open_dataset(f"{protocol}://{BUCKET}/demo")
+    assert "attempts" not in str(raised.value)
 
 
 def test_without_network_the_cache_serves(frozen: Path, monkeypatch: pytest.MonkeyPatch) -> None:

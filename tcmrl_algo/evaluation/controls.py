@@ -354,7 +354,7 @@ def controls_file(about: Controls) -> Path:
 def measure_controls(dataset: Dataset, *, report: ProgressCallback = ignore_progress) -> Controls:
     """As `dataset_controls`, without the kept file."""
     if not dataset.train_tasks or not dataset.test_tasks:
-        raise TrainingError(f"{dataset.folder} has no training or no test task; build both for controls")
+        raise TrainingError(f"{dataset.path} has no training or no test task; build both for controls")
     tests, bench = dataset.test_tasks, ControlBench(dataset, report)
     nothing: list[float | None] = [None] * len(tests)
     try:

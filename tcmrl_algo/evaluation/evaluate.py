@@ -201,7 +201,7 @@ def evaluate_run(
     tasks = dataset.test_tasks
     if not tasks:
         raise TrainingError(
-            f"{dataset.folder} contains no test task; build one with `tcmrl-data build --tasks`"
+            f"{dataset.path} contains no test task; build one with `tcmrl-data build --tasks`"
         )
     config = run.record.config
     config = config.model_copy(update={"settings": config.settings.model_copy(update={"run": settings})})

@@ -150,12 +150,12 @@ class Run:
         """
         if dataset.name != self.record.environment:
             raise CheckpointError(
-                f"{dataset.folder} holds {dataset.name!r}, the run in {self.folder} is of "
+                f"{dataset.path} holds {dataset.name!r}, the run in {self.folder} is of "
                 f"{self.record.environment!r}; name the right one with --dataset"
             )
         if dataset.manifest.root != self.record.root:
             raise CheckpointError(
-                f"{dataset.folder} has root {dataset.manifest.root[:12]}, the run in {self.folder} was "
+                f"{dataset.path} has root {dataset.manifest.root[:12]}, the run in {self.folder} was "
                 f"trained on {self.record.root[:12]}; name that dataset with --dataset, or train anew"
             )
 

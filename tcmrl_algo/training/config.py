@@ -81,9 +81,7 @@ def resolve_for(
     """
     known = dataset.manifest.training
     if profile not in known:
-        raise TrainingError(
-            f"{dataset.folder} has no training table {profile!r}; known are {', '.join(known)}"
-        )
+        raise TrainingError(f"{dataset.path} has no training table {profile!r}; known are {', '.join(known)}")
     return resolve(
         known[profile],
         place=f"training table of {dataset.name!r}, profile {profile!r}",

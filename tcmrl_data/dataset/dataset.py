@@ -236,7 +236,7 @@ class Dataset:
         """
         task = self._tasks_by_index.get(index)
         if task is None:
-            raise TaskError(f"{self.folder} holds no task {index}; build it with --tasks {index}")
+            raise TaskError(f"{self.path} holds no task {index}; build it with --tasks {index}")
         return task
 
     def split_of(self, task: int) -> Split | None:
@@ -266,9 +266,7 @@ class Dataset:
         """
         keys = self.parts.keys_of(task)
         if not keys or self.missing(task):
-            raise ManifestError(
-                f"{self.folder}: task {task} is incomplete; finish it with `tcmrl-data build`"
-            )
+            raise ManifestError(f"{self.path}: task {task} is incomplete; finish it with `tcmrl-data build`")
         entries = [self.entry(key) for key in keys]
         first = {name: getattr(entries[0], name) for name in REFERENCES}
         return TaskReferences(**first, behavior=max(entry.mean for entry in entries))
@@ -281,7 +279,7 @@ class Dataset:
         """
         entry = self.parts.entry(key)
         if entry is None:
-            raise SelectionError(f"{self.folder} has no part of {key}")
+            raise SelectionError(f"{self.path} has no part of {key}")
         return entry
 
     def file_of(self, key: PartKey) -> Path:
@@ -424,7 +422,7 @@ class Dataset:
         chosen = [task for task in chosen if split is None or task.split == split]
         if not chosen:
             raise SelectionError(
-                f"{self.folder}: no {split or 'such'} tasks in the dataset; build some with --tasks"
+                f"{self.path}: no {split or 'such'} tasks in the dataset; build some with --tasks"
             )
         parts = {task.index: chosen_parts(self, task.index, rule) for task in chosen}
         return Selection(self, tuple(chosen), parts, allow_test, rule)

@@ -207,7 +207,7 @@ def list_episodes(dataset: Dataset, *, task: int | None = None, step: int | None
     ]
     if not keys:
         steps = sorted({key.step for one in tasks for key in dataset.parts.keys_of(one.index)})
-        raise SelectionError(f"{dataset.folder} has no snapshot of step {step}; its steps are {steps}")
+        raise SelectionError(f"{dataset.path} has no snapshot of step {step}; its steps are {steps}")
     rows = [
         {"task": key.task, "step": key.step, "run": key.run, "episode": episode} | _episode(trajectory)
         for key in keys

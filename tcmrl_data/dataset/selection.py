@@ -43,7 +43,7 @@ def chosen_parts(dataset: "Dataset", task: int, rule: str) -> tuple[PartKey, ...
     missing = [key.step for key in dataset.missing(task)]
     if missing:
         raise SelectionError(
-            f"{dataset.folder}: task {task} lacks snapshots {missing}; finish it with `tcmrl-data build`"
+            f"{dataset.path}: task {task} lacks snapshots {missing}; finish it with `tcmrl-data build`"
         )
     keys = dataset.parts.keys_of(task)
     match = _RULE.fullmatch(rule.replace(" ", ""))
@@ -65,7 +65,7 @@ def chosen_parts(dataset: "Dataset", task: int, rule: str) -> tuple[PartKey, ...
         chosen = tier_parts(dataset, task, match[3])
     if not chosen:
         raise SelectionError(
-            f"{dataset.folder}: snapshots {rule!r} leaves nothing of task {task}, "
+            f"{dataset.path}: snapshots {rule!r} leaves nothing of task {task}, "
             f"which has {[key.step for key in keys]}"
         )
     return tuple(chosen)

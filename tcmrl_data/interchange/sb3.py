@@ -32,7 +32,7 @@ def to_sb3_buffer(selection: Selection, task: int, *, device: str = "cpu") -> "R
     trajectories = selection.trajectories(task) if task in selection.parts else []
     if not any(map(len, trajectories)):
         raise SelectionError(
-            f"{selection.dataset.folder}: the selection holds no transition of task {task}; it has the tasks "
+            f"{selection.dataset.path}: the selection holds no transition of task {task}; it has the tasks "
             f"{sorted(selection.parts)}"
         )
     rows = transitions(trajectories)

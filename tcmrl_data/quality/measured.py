@@ -135,7 +135,7 @@ def filled_parts(dataset: Dataset) -> list[PartKey]:
     table = dataset.parts
     keys = [key for key, steps in zip(table, table.columns["steps"], strict=True) if steps]
     if not keys:
-        raise SelectionError(f"{dataset.folder} has no steps to measure; build it with `tcmrl-data build`")
+        raise SelectionError(f"{dataset.path} has no steps to measure; build it with `tcmrl-data build`")
     return keys
 
 

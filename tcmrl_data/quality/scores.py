@@ -211,7 +211,7 @@ def plot_returns(dataset: Dataset, table: dict[str, Any], file: Path) -> None:
     """
     measured.check_picture(file)
     if not any(task["snapshots"] for task in table["tasks"]):
-        raise SelectionError(f"{dataset.folder} has no parts to plot; build it with `tcmrl-data build`")
+        raise SelectionError(f"{dataset.path} has no parts to plot; build it with `tcmrl-data build`")
     figure = measured.new_figure(7.0, 4.2)
     axes = figure.subplots()
     for split, color in zip(SPLITS, ("tab:blue", "tab:orange"), strict=True):

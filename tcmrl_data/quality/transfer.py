@@ -146,7 +146,7 @@ def _chosen_tasks(dataset: Dataset, number: int) -> list[Task]:
     chosen = [*evenly_spread(train, max(1, number - num_test)), *evenly_spread(test, num_test)]
     if len(chosen) < 2 or not train:
         raise SelectionError(
-            f"{dataset.folder}: policies are compared between at least two complete tasks, one of them for "
+            f"{dataset.path}: policies are compared between at least two complete tasks, one of them for "
             f"training; {len(complete)} of {len(dataset.tasks)} are complete, {number} were wanted at most"
         )
     return chosen

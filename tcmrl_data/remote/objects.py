@@ -45,10 +45,8 @@ PASSING = (400, 408, 409, 425, 429)
 """Answers of the kind 4xx after which a request may succeed if it is made again; S3 says 400 where bytes of a
 body were lost on the way."""
 
-CREDENTIALS = (
-    "check the credentials in the environment, and what they allow; set AWS_SKIP_SIGNATURE=true for a bucket "
-    "that is open to all"
-)
+SETTINGS = {"s3": "AWS", "gs": "GOOGLE", "az": "AZURE"}
+"""How the variables of the environment begin that name the credentials of a protocol."""
 
 MOST_FILES = 2_000_000
 """Files that a listing may name; a dataset has a million parts at most."""
@@ -60,6 +58,9 @@ GLANCE = 0.02
 """Seconds between two looks at an answer that arrives."""
 
 _STATUS = re.compile(r"status code: (\d{3})")
+
+_TOKEN = re.compile(r"token request|/api/token|<Code>[A-Za-z]*Token")
+"""A token that is refused, or asked of the machine itself, since the environment names no credentials."""
 
 Item = TypeVar("Item")
 Made = TypeVar("Made")
@@ -296,16 +297,21 @@ class Objects:
             except FileNotFoundError:
                 raise MissingObjectError(f"{place} does not exist") from None
             except refused as error:
-                raise RemoteError(f"{place}: {_reason(error)}; {CREDENTIALS}") from None
+                raise RemoteError(f"{place}: {_reason(error)}; {_credentials(self.address)}") from None
             except DamageError:  # on the way, or there
                 if attempt >= DAMAGED_AGAIN:
                     raise
             except (obstore.exceptions.BaseError, TimeoutError) as error:
                 if attempt == len(PAUSES) or not _may_pass(error):
                     tried = f" after {attempt + 1} attempts" if attempt else ""
+                    remedy = (
+                        _credentials(self.address)
+                        if _TOKEN.search(str(error))
+                        else "check address and network"
+                    )
                     raise RemoteError(
-                        f"{place}: {_reason(error)}{tried}; check address and network, then run the same "
-                        "command again to continue"
+                        f"{place}: {_reason(error)}{tried}; {remedy}, then run the same command again to "
+                        "continue"
                     ) from None
             time.sleep(PAUSES[attempt] * spread)
         raise AssertionError("the last attempt returns or raises")
@@ -343,7 +349,15 @@ def _make_store(address: Address) -> Any:
             return obstore.store.HTTPStore.from_url(base, client_options=client, retry_config=retries)
         return obstore.store.from_url(base, client_options=client, retry_config=retries)
     except (obstore.exceptions.BaseError, ValueError) as error:
-        raise RemoteError(f"{address.base}: {_reason(error)}; {CREDENTIALS}") from None
+        raise RemoteError(f"{address.base}: {_reason(error)}; {_credentials(address)}") from None
+
+
+def _credentials(address: Address) -> str:
+    """What to do where a server refuses."""
+    words = "check the credentials in the environment, and what they allow"
+    if address.protocol in WEB:
+        return words
+    return f"{words}; set {SETTINGS[address.protocol]}_SKIP_SIGNATURE=true for a bucket that is open to all"
 
 
 def _hub_token() -> str | None:
@@ -365,7 +379,9 @@ def _md5_of(e_tag: str | None) -> str | None:
 def _may_pass(error: Exception) -> bool:
     """Whether the same request may succeed later."""
     found = _STATUS.search(str(error))
-    return found is None or not 400 <= int(found[1]) < 500 or int(found[1]) in PASSING
+    if found is None:
+        return not _TOKEN.search(str(error))
+    return not 400 <= int(found[1]) < 500 or int(found[1]) in PASSING
 
 
 def _reason(error: Exception) -> str:

@@ -133,7 +133,7 @@ def cached_rows(
             rows = _open_entry(entry, selection, dense)  # another process may have decoded it meanwhile
             if rows is None:
                 if say:
-                    say(f"decoding {selection.dataset.folder} into {entry}; this happens once")
+                    say(f"decoding {selection.dataset.path} into {entry}; this happens once")
                 _write_entry(folder, entry, selection, dense)
                 rows = _open_entry(entry, selection, dense, checked=0)  # it was hashed just now
     if rows is None:
