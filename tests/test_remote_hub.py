@@ -1,9 +1,15 @@
-"""Datasets of the Hugging Face Hub: its own client against a stub of the routes that are used."""
+"""Datasets of the Hugging Face Hub: its own client against a stub of the routes that are used.
+
+And the page of buckets and the Hub, against servers of this machine.
+"""
 
 # ruff: noqa: F811 # fixtures of another file
+import dataclasses
 import os
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -19,7 +25,17 @@ from tcmrl_data.foundation.errors import RemoteError
 from tcmrl_data.remote import hub
 from tcmrl_data.store.manifest import MANIFEST
 from tests.hub_stub import HubStub
-from tests.remotes import frozen, last, own_fetched_parts, sealed_files  # noqa: F401 # fixtures
+from tests.page_blocks import Command, blocks, commands
+from tests.remotes import (  # noqa: F401 # fixtures
+    Proxy,
+    folder_server,
+    frozen,
+    last,
+    own_fetched_parts,
+    sealed_files,
+    server,
+)
+from tests.test_pages_run import demo, run  # noqa: F401 # fixture
 
 URL = "hf://datasets/owner/name"
 
@@ -153,3 +169,29 @@ def test_the_library_of_the_hub_reads_both_splits(stub: HubStub, frozen: Path, t
         "train": sum(len(opened.parts.keys_of(task.index)) for task in opened.train_tasks),
         "test": sum(len(opened.parts.keys_of(task.index)) for task in opened.test_tasks),
     }
+
+
+@pytest.mark.sweep
+def test_the_page_of_buckets_runs_as_printed(
+    server: Proxy,
+    stub: HubStub,
+    demo: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    stub.repository = "OWNER/demo"
+    monkeypatch.chdir(tmp_path)
+    for name in ("demo", "built-here"):
+        shutil.copytree(demo, tmp_path / "data" / name)
+    namespace: dict[str, Any] = {}
+    with folder_server(tmp_path / "data") as web:
+        for block in blocks("docs/how-to/remote.md"):
+            for address in ("http://localhost:8000", "https://example.org"):
+                block = dataclasses.replace(block, text=block.text.replace(address, web))
+            if block.language == "python":
+                exec(compile(block.text, block.place, "exec"), namespace)
+            for command in commands(block):
+                short = ("--stop-at", "20") if command.words[1] == "train" else ()
+                run(Command(command.words + short), block, capsys)
+    assert open_dataset("data/copy").manifest.digest == open_dataset(demo).manifest.digest
