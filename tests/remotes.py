@@ -202,6 +202,9 @@ def seaweedfs(folder: Path) -> Iterator[str]:
             f"-ip={HOST}",
             f"-ip.bind={HOST}",
             "-s3",
+            "-s3.port.iceberg=0",  # a port of its own, which two servers cannot have
+            "-s3.port.lance=0",
+            "-master.telemetry=false",
             "-volume.max=8",
             f"-s3.config={config}",
             *words,
@@ -238,11 +241,13 @@ def _wait_for(port: int) -> None:
 def make_bucket(endpoint: str, name: str) -> None:
     """Creates a bucket; the server may need a moment before it can."""
     import boto3
+    from botocore.config import Config
     from botocore.exceptions import BotoCoreError, ClientError
 
-    for _ in range(100):
+    once = Config(retries={"total_max_attempts": 1})
+    for _ in range(300):
         try:
-            boto3.client("s3", endpoint_url=endpoint).create_bucket(Bucket=name)
+            boto3.client("s3", endpoint_url=endpoint, config=once).create_bucket(Bucket=name)
             return
         except (BotoCoreError, ClientError):
             time.sleep(0.2)
