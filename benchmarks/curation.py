@@ -59,7 +59,6 @@ def make_dataset(folder: Path, *, tasks: int, rows: int, seed: int) -> Dataset:
             entries.append(part_entry(record, run=MAIN_RUN, platform=0, archive=data))
     write_dataset(
         folder,
-        name=recipe.environment.name,
         label=None,
         data_version=DATA_VERSION,
         runs=[Run(name=MAIN_RUN, kind="built", seed=seed, recipe=recipe, steps=STEPS)],

@@ -113,7 +113,6 @@ def made_dataset(
     run = Run(name=MAIN_RUN, kind="built", seed=seed, recipe=recipe, steps=steps)
     write_dataset(
         folder,
-        name=recipe.environment.name,
         label=None,
         data_version=DATA_VERSION,
         runs=[run],

@@ -38,7 +38,6 @@ def reseal(dataset: Dataset, **changes: object) -> None:
     """Writes tables and manifest anew, as someone does who forges a dataset."""
     manifest = dataset.manifest
     settings = {
-        "name": manifest.name,
         "label": manifest.label,
         "data_version": manifest.data_version,
         "runs": manifest.runs,

@@ -52,12 +52,11 @@ def changed(
         platform=record.platform,
     )
     with open_assembly(out, derivation_of("test", {}, [tiny]), [tiny]) as assembly:
-        assembly.copy([PlannedPart(key, tiny, key) for key in tiny.parts if key != KEY])
+        for key in tiny.parts:
+            if key != KEY:
+                assembly.copy(PlannedPart(key, tiny, key))
         assembly.write(KEY, lambda: made)
-        manifest = tiny.manifest
-        assembly.finish(
-            name=manifest.name, data_version=manifest.data_version, runs=manifest.runs, tasks=tiny.tasks
-        )
+        assembly.finish(runs=tiny.manifest.runs, tasks=tiny.tasks)
     return open_dataset(out)
 
 

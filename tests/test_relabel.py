@@ -153,7 +153,7 @@ def forged(dataset: Dataset, out: Path, change: Callable[[Trajectory], Trajector
             record = dataset.part(*key)
             identity = record.identity
             if identity.derived is None:
-                assembly.copy([PlannedPart(key, dataset, key)])
+                assembly.copy(PlannedPart(key, dataset, key))
             else:
                 made = make_part(
                     WantedPart(
@@ -169,10 +169,7 @@ def forged(dataset: Dataset, out: Path, change: Callable[[Trajectory], Trajector
                     platform=record.platform,
                 )
                 assembly.write(key, functools.partial(copy.copy, made))
-        manifest = dataset.manifest
-        assembly.finish(
-            name=manifest.name, data_version=manifest.data_version, runs=manifest.runs, tasks=dataset.tasks
-        )
+        assembly.finish(runs=dataset.manifest.runs, tasks=dataset.tasks)
     return out
 
 

@@ -213,7 +213,6 @@ class Ledger:
         )
         runs = [main, *(earlier.runs[1:] if earlier else ())]
         return manifest_bytes(
-            name=plan.environment.name,
             label=earlier.label if earlier else None,
             data_version=DATA_VERSION,
             runs=runs,

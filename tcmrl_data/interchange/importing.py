@@ -24,7 +24,7 @@ from tcmrl_data.parts.operation import WantedPart
 from tcmrl_data.recipe.imported import bound_recipe, check_licence, foreign_recipe
 from tcmrl_data.recipe.recipe import Recipe
 from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part import DATA_VERSION, STANDARD_ARRAYS, PartRecord
+from tcmrl_data.store.part import STANDARD_ARRAYS, PartRecord
 from tcmrl_data.store.tables import (
     MAIN_RUN,
     MAX_ARRAYS,
@@ -176,13 +176,7 @@ def import_dataset(
         for before, now in zip(digests, source.digests(), strict=True):
             if before != now:
                 raise StoreError(f"{now[0]} changed meanwhile; remove {out} and import again")
-        manifest = assembly.finish(
-            name=report.environment,
-            data_version=DATA_VERSION,
-            runs=[run],
-            tasks=[*imported.values()],
-            label=label,
-        )
+        manifest = assembly.finish(runs=[run], tasks=[*imported.values()], label=label)
     return dataclasses.replace(report, root=manifest.root)
 
 

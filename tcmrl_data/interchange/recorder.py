@@ -25,7 +25,7 @@ from tcmrl_data.recipe.imported import check_licence
 from tcmrl_data.store.archive import Archive
 from tcmrl_data.store.arrays import read_arrays, unpack
 from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.part import DATA_VERSION, STANDARD_ARRAYS, PartRecord
+from tcmrl_data.store.part import STANDARD_ARRAYS, PartRecord
 from tcmrl_data.store.tables import MAIN_RUN, PartKey, key_of_file, part_folder
 
 
@@ -169,13 +169,7 @@ class DatasetRecorder(gymnasium.Wrapper[Any, Any, Any, Any]):
             self._end_episode(terminated=False, truncated=True)
             self._publish()
             if self._published_episodes:
-                self._assembly.finish(
-                    name=self._recipe.environment.name,
-                    data_version=DATA_VERSION,
-                    runs=[self._run],
-                    tasks=[self._task],
-                    label=self._label,
-                )
+                self._assembly.finish(runs=[self._run], tasks=[self._task], label=self._label)
                 remove_tree(self._out / CHECKPOINTS)
         self.env.close()
 

@@ -1,23 +1,22 @@
-"""Applying an operation to parts of a dataset: in which runs the new parts lie, and how they are made."""
+"""Applying an operation to parts of a dataset: what it may read, and in which runs the new parts lie."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from tcmrl_data.building.work_files import check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
 from tcmrl_data.envs.base import Task
-from tcmrl_data.foundation.disk import LOCK, lock_file, remove_abandoned
-from tcmrl_data.foundation.errors import BuildError, NondeterminismError, SelectionError, StoreError
+from tcmrl_data.foundation.errors import BuildError, NondeterminismError, SelectionError
 from tcmrl_data.foundation.records import validate_table
-from tcmrl_data.operations.assembly import PlannedPart, append_parts, derivation_of, open_assembly
-from tcmrl_data.parts.jobs import DeriveSpec, Job, derive_parts
+from tcmrl_data.operations.assembly import Plan, carry_out, derivation_of
+from tcmrl_data.parts.jobs import DeriveSpec, Job
 from tcmrl_data.parts.operation import OPERATIONS
 from tcmrl_data.parts.own_operations import OWN_OPERATIONS, operation_of_run
 from tcmrl_data.recipe.recipe import Recipe
-from tcmrl_data.store.manifest import FOREIGN_KINDS, Derivation, Manifest, Run, read_manifest
+from tcmrl_data.store.manifest import FOREIGN_KINDS, Run
 from tcmrl_data.store.part import this_platform
 from tcmrl_data.store.tables import MAIN_RUN, PartKey
 
@@ -76,78 +75,21 @@ def apply_operation(
         origin=source.origin if foreign else {"operation": operation, "of": MAIN_RUN, "settings": common},
         steps=None,
     )
-    tasks_of = sorted({key.task for key in keys})
-    names = {(task, task): operation for task in tasks_of}
+    indices = sorted({key.task for key in keys})
     recorded = {
         "operation": operation,
         "settings": common,
-        "tasks": tasks_of,
+        "tasks": indices,
         "snapshots": snapshots,
         "of": MAIN_RUN,
         "run": operation,
     }
-    jobs = tuple(jobs_of_pairs(names, keys))
+    runs, jobs = runs_of_pairs([(index, index) for index in indices], keys, template)
     spec = DeriveSpec(dataset.path_on_disk, Path(out), operation, common, recipe, source.seed, jobs)
     derivation = derivation_of("apply", recorded, [dataset])
-    runs = runs_like(template, names)
-    make_of_parts(dataset, Path(out), spec, derivation=derivation, runs=runs, workers=workers)
+    tasks_of = [dataset.task(index) for index in indices]
+    carry_out(Plan(runs, tasks_of, (), derivation, [dataset], spec=spec), Path(out), workers=workers)
     return open_dataset(out)
-
-
-def make_of_parts(
-    dataset: Dataset,
-    out: Path,
-    spec: DeriveSpec,
-    *,
-    derivation: Derivation,
-    runs: Sequence[Run],
-    with_old: bool = False,
-    label: str | None = None,
-    workers: int | None,
-    progress: Callable[[int, int], None] | None = None,
-) -> Manifest:
-    """Makes a dataset of the parts that an operation makes of another's.
-
-    Args:
-        derivation: what is made; the same one goes on after a stop.
-        with_old: the new dataset has all parts of the other, too.
-    """
-    kept = {job.key.task for job in spec.jobs}
-    with open_assembly(out, derivation, [dataset]) as assembly:
-        if with_old:
-            assembly.copy([PlannedPart(key, dataset, key) for key in dataset.parts])
-        for published in derive_parts(spec, workers=workers, progress=progress):
-            assembly.take(published)
-        return assembly.finish(
-            name=dataset.name,
-            data_version=dataset.manifest.data_version,
-            runs=runs,
-            tasks=[task for task in dataset.tasks if with_old or task.index in kept],
-            label=label,
-        )
-
-
-def add_parts(
-    dataset: Dataset,
-    spec: DeriveSpec,
-    *,
-    runs: Sequence[Run],
-    workers: int | None,
-    progress: Callable[[int, int], None] | None,
-) -> Manifest:
-    """Adds the parts that an operation makes of a dataset's to the dataset itself; arguments as above."""
-    folder = dataset.folder
-    if dataset.path != folder:
-        raise StoreError(
-            f"{dataset.path} is a view, to which no parts can be added; name a new dataset by --out"
-        )
-    check_work_files(folder)
-    with lock_file(folder / LOCK, f"dataset {folder}"):
-        remove_abandoned(folder)
-        if read_manifest(folder).digest != dataset.manifest.digest:
-            raise StoreError(f"{folder} has changed meanwhile; run the same command again")
-        made = derive_parts(spec, workers=workers, progress=progress)
-        return append_parts(dataset, runs=runs, parts=made)
 
 
 def simulated_run(dataset: Dataset, name: str) -> tuple[Run, Recipe, int]:
@@ -233,46 +175,27 @@ def nearest_pairs(tasks: Sequence[Task], chosen: Sequence[Task], number: int) ->
     ]
 
 
-def runs_of_pairs(pairs: Iterable[Pair], run: str) -> dict[Pair, str]:
-    """The runs in which the parts of pairs lie, so that no two of a task have the same key.
+def runs_of_pairs(
+    pairs: Iterable[Pair], keys: Sequence[PartKey], template: Run
+) -> tuple[list[Run], tuple[Job, ...]]:
+    """The runs, and the parts in them, that are made of the keys of the pairs' first tasks.
 
-    The first pair that goes to a task is in `run`, the second one in `run-2`, and so on.
+    Of the pairs that go to a task, the parts of the first one are in the template's run, those of the second
+    one in `<run>-2` and so on, so that no two parts have the same key.
     """
-    counts: dict[int, int] = {}
-    runs = {}
+    counts: Counter[int] = Counter()
+    sources: dict[str, list[Pair]] = {}
+    jobs: list[Job] = []
     for source, target in pairs:
-        counts[target] = counts.get(target, 0) + 1
-        runs[source, target] = run if counts[target] == 1 else f"{run}-{counts[target]}"
-    return runs
-
-
-def runs_like(template: Run, names: Mapping[Pair, str]) -> list[Run]:
-    """The runs of pairs: each as the template, with its own name and the tasks that its parts are from."""
-    return [
-        template.model_copy(
-            update={
-                "name": name,
-                "sources": tuple(
-                    sorted(
-                        (target, source)
-                        for (source, target), found in names.items()
-                        if found == name and source != target
-                    )
-                ),
-            }
-        )
-        for name in dict.fromkeys(names.values())
-    ]
-
-
-def jobs_of_pairs(runs: Mapping[Pair, str], keys: Sequence[PartKey]) -> list[Job]:
-    """The parts that are made of the keys of the pairs' first tasks, in the runs of the pairs."""
-    return [
-        Job(key, PartKey(target, key.step, run))
-        for (source, target), run in runs.items()
-        for key in keys
-        if key.task == source
-    ]
+        counts[target] += 1
+        name = template.name if counts[target] == 1 else f"{template.name}-{counts[target]}"
+        sources.setdefault(name, []).append((target, source))
+        jobs += [Job(key, PartKey(target, key.step, name)) for key in keys if key.task == source]
+    runs = []
+    for name, found in sources.items():
+        others = tuple(sorted((target, source) for target, source in found if target != source))
+        runs.append(template.model_copy(update={"name": name, "sources": others}))
+    return runs, tuple(jobs)
 
 
 def _scaled(tasks: Sequence[Task]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -20,34 +20,17 @@ from tcmrl_data.foundation.disk import (
     replace_file,
     sync_files,
 )
-from tcmrl_data.foundation.errors import BuildError, StoreError
+from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.files import read_plain_file
-from tcmrl_data.foundation.records import canonical_json, sealed, sha256, write_ranges
+from tcmrl_data.foundation.records import canonical_json, sha256, write_ranges
+from tcmrl_data.parts.jobs import DeriveSpec, derive_parts
 from tcmrl_data.parts.making import Published, make_from, numbered, publish
 from tcmrl_data.parts.operation import Operation, StoredPart, can_be_made_again
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
-from tcmrl_data.store.manifest import (
-    Derivation,
-    Manifest,
-    Run,
-    Source,
-    is_complete,
-    read_manifest,
-    totals_of,
-    write_dataset,
-    write_manifest,
-)
-from tcmrl_data.store.part import PartRecord, Platform
-from tcmrl_data.store.part_table import PARTS_TABLE, PartEntry, PartTable, part_line
-from tcmrl_data.store.tables import (
-    MAX_PARTS,
-    MAX_PLATFORMS,
-    MAX_RUNS,
-    PartKey,
-    TableWriter,
-    part_file,
-    read_sealed,
-)
+from tcmrl_data.store.manifest import Derivation, Manifest, Run, Source, write_dataset
+from tcmrl_data.store.part import DATA_VERSION, PartRecord, Platform
+from tcmrl_data.store.part_table import PartEntry, PartTable
+from tcmrl_data.store.tables import MAX_PARTS, PartKey, part_file
 
 Progress = Callable[[int, int], None]
 """Called with parts done and parts in all."""
@@ -66,11 +49,6 @@ class PlannedPart:
     source_key: PartKey
     operation: Operation[Any] | None = None
 
-    @property
-    def entry(self) -> PartEntry:
-        """The line of the other part in its table."""
-        return self.source.entry(self.source_key)
-
     def make(self) -> tuple[PartRecord, bytes]:
         """The record and the archive of a part that is made anew."""
         assert self.operation is not None
@@ -84,26 +62,21 @@ class Plan:
 
     Attributes:
         runs: how the parts were made, the first with a recipe.
+        spec: of further parts, which workers make.
     """
 
-    name: str
-    data_version: int
-    runs: tuple[Run, ...]
-    tasks: tuple[Task, ...]
-    parts: tuple[PlannedPart, ...]
+    runs: Sequence[Run]
+    tasks: Sequence[Task]
+    parts: Sequence[PlannedPart]
     derivation: Derivation
-    sources: tuple[Dataset, ...]
+    sources: Sequence[Dataset]
     label: str | None = None
+    spec: DeriveSpec | None = None
 
     @property
     def num_cut(self) -> int:
-        """Number of parts that are made anew."""
+        """Number of parts that are cut from others."""
         return sum(part.operation is not None for part in self.parts)
-
-    @property
-    def bytes(self) -> int:
-        """Size of the archives; of parts that are cut, that of the whole parts."""
-        return sum(part.entry.size for part in self.parts)
 
 
 def derivation_of(
@@ -147,52 +120,40 @@ class Assembly:
 
     Example:
         >>> with open_assembly(out, derivation, [source]) as assembly:  # doctest: +SKIP
-        ...     assembly.copy([PlannedPart(key, source, key) for key in source.parts])
+        ...     for key in source.parts:
+        ...         assembly.copy(PlannedPart(key, source, key))
         ...     assembly.finish(tasks=source.tasks, runs=source.manifest.runs)
     """
 
     def __init__(self, out: Path, derivation: Derivation, sources: Sequence[Dataset]) -> None:
         self._out, self._derivation, self._sources = out, derivation, tuple(sources)
-        self._entries: list[PartEntry] = []
-        self._platforms: list[Platform] = []
+        self._parts: list[Published] = []
         self._copied: list[Path] = []
 
-    def copy(
-        self,
-        parts: Sequence[PlannedPart],
-        *,
-        progress: Callable[[int, int], None] | None = None,
-    ) -> None:
-        """Copies whole parts; each is hashed on the way.
+    def copy(self, part: PlannedPart) -> None:
+        """Copies a whole part, which is hashed on the way.
 
         Raises:
-            StoreError: a part of a source is missing or damaged; the message names it.
+            StoreError: the part is missing or damaged; the message names it.
         """
-        make_folders(self._out / STAGING)
-        for done, part in enumerate(parts, start=1):
-            entry = self._copy(part)
-            self._add(entry, part.source.manifest.platforms[entry.platform])
-            if progress is not None:
-                progress(done, len(parts))
-        self._copied += [self._out / part_file(part.key) for part in parts]
+        target, entry = self._out / part_file(part.key), part.source.entry(part.source_key)
+        if not holds_part(target, entry):
+            place_file(target, part.source.content(part.source_key), staging=self._out / STAGING)
+        self._copied.append(target)
+        platform = part.source.manifest.platforms[entry.platform]
+        self.take(Published(entry._replace(run=part.key.run), platform))
 
     def write(self, key: PartKey, make: Callable[[], tuple[PartRecord, bytes]]) -> PartEntry:
         """Publishes a new part, unless an attempt that was stopped has done so."""
-        return self.take(publish(self._out, key, make))
+        published = publish(self._out, key, make)
+        self.take(published)
+        return published.entry
 
-    def take(self, published: Published) -> PartEntry:
-        """Adds a part that another process has published in the folder."""
-        return self._add(published.entry, published.platform)
+    def take(self, published: Published) -> None:
+        """Adds a part that is in its place in the folder."""
+        self._parts.append(published)
 
-    def finish(
-        self,
-        *,
-        name: str,
-        data_version: int,
-        runs: Sequence[Run],
-        tasks: Sequence[Task],
-        label: str | None = None,
-    ) -> Manifest:
+    def finish(self, *, runs: Sequence[Run], tasks: Sequence[Task], label: str | None = None) -> Manifest:
         """Writes tables and manifest; the dataset exists from then on.
 
         Raises:
@@ -201,37 +162,24 @@ class Assembly:
         for source in self._sources:
             if open_dataset(source.path).manifest.digest != source.manifest.digest:
                 raise StoreError(f"{source.path} has changed meanwhile; run the same command again")
-        if not 0 < len(self._entries) <= MAX_PARTS:
+        if not 0 < len(self._parts) <= MAX_PARTS:
             raise StoreError(
-                f"{self._out} would have {len(self._entries)} parts; 1 to {MAX_PARTS} are possible"
+                f"{self._out} would have {len(self._parts)} parts; 1 to {MAX_PARTS} are possible"
             )
         sync_files(self._out, self._copied)
+        platforms: list[Platform] = []
         manifest = write_dataset(
             self._out,
-            name=name,
             label=label,
-            data_version=data_version,
+            data_version=self._sources[0].manifest.data_version if self._sources else DATA_VERSION,
             runs=runs,
             derivation=self._derivation,
-            platforms=self._platforms,
+            table=PartTable.empty().with_entries(numbered(self._parts, platforms)),
+            platforms=platforms,
             tasks=tasks,
-            table=PartTable.empty().with_entries(self._entries),
         )
         (self._out / ASSEMBLY).unlink()
         return manifest
-
-    def _copy(self, part: PlannedPart) -> PartEntry:
-        target, entry = self._out / part_file(part.key), part.entry
-        if not holds_part(target, entry):
-            place_file(target, part.source.content(part.source_key), staging=self._out / STAGING)
-        return entry._replace(run=part.key.run)
-
-    def _add(self, entry: PartEntry, platform: Platform) -> PartEntry:
-        if platform not in self._platforms:
-            self._platforms.append(platform)
-        entry = entry._replace(platform=self._platforms.index(platform))
-        self._entries.append(entry)
-        return entry
 
 
 def holds_part(file: Path, entry: PartEntry) -> bool:
@@ -277,73 +225,36 @@ def _note(derivation: Derivation) -> bytes:
     return canonical_json(derivation.model_dump(mode="json"))
 
 
-def append_parts(dataset: Dataset, *, runs: Sequence[Run], parts: Sequence[Published]) -> Manifest:
-    """Adds published parts to a dataset; they belong to it as soon as the new manifest is there.
-
-    The lines of the parts are forced to disk before the manifest that seals them. A crash leaves the dataset
-    as it was, with files of parts that the same command finds again. The caller holds the dataset's lock.
-
-    Args:
-        parts: the new parts, whose files are in their places.
-
-    Raises:
-        BuildError: more parts, runs or platforms than a dataset may have.
-    """
-    manifest, folder = dataset.manifest, dataset.folder
-    if read_manifest(folder).digest != manifest.digest:
-        raise StoreError(f"{folder} has changed meanwhile; run the same command again")
-    platforms = list(manifest.platforms)
-    entries = sorted(numbered(parts, platforms), key=lambda entry: entry.key)
-    recorded = dataset.recorded_parts.with_entries(entries)
-    for what, found, limit in (
-        ("parts", len(recorded), MAX_PARTS),
-        ("runs", len(runs), MAX_RUNS),
-        ("platforms", len(platforms), MAX_PLATFORMS),
-    ):
-        if found > limit:
-            raise BuildError(f"{folder} would have {found} {what}, more than the {limit} that are allowed")
-    table = TableWriter(folder / PARTS_TABLE, read_sealed(folder / PARTS_TABLE, manifest.parts))
-    table.append(b"".join(map(part_line, entries)))
-    table.sync()
-    kept = recorded.without_tasks(manifest.dropped)
-    fields = manifest.model_dump(mode="json", exclude={"digest"}) | {
-        "runs": [run.model_dump(mode="json") for run in runs],
-        "platforms": [platform.model_dump(mode="json") for platform in platforms],
-        "parts": table.seal.model_dump(),
-        "totals": totals_of(kept).model_dump(),
-        "root": kept.root,
-        "complete": is_complete(kept, runs, num_tasks=manifest.num_tasks),
-    }
-    write_manifest(folder, sealed(fields))
-    return read_manifest(folder)
-
-
-def carry_out(plan: Plan, out: Path, progress: Progress | None = None) -> Manifest:
+def carry_out(
+    plan: Plan, out: Path, progress: Progress | None = None, *, workers: int | None = None
+) -> Manifest:
     """Makes a planned dataset, or finishes one whose making was stopped.
 
     Raises:
+        BuildError: a worker failed; what was published is kept.
         StoreError: the folder holds something else, a part of a source is damaged, or a source has changed.
     """
-    whole = [part for part in plan.parts if part.operation is None]
+    ready = len(plan.parts)
+    total = ready + (len(plan.spec.jobs) if plan.spec is not None else 0)
     with open_assembly(out, plan.derivation, plan.sources) as assembly:
-        assembly.copy(
-            whole,
-            progress=None if progress is None else lambda done, _: progress(done, len(plan.parts)),
-        )
-        made = 0
-        for part in plan.parts:
-            if part.operation is not None:
-                made += 1
+        whole_first = sorted(plan.parts, key=lambda part: part.operation is not None)
+        for done, part in enumerate(whole_first, start=1):
+            if part.operation is None:
+                assembly.copy(part)
+            else:
                 assembly.write(part.key, part.make)
-                if progress is not None:
-                    progress(len(whole) + made, len(plan.parts))
-        return assembly.finish(
-            name=plan.name,
-            data_version=plan.data_version,
-            runs=plan.runs,
-            tasks=plan.tasks,
-            label=plan.label,
-        )
+            if progress is not None:
+                progress(done, total)
+        if plan.spec is not None:
+            made = derive_parts(plan.spec, workers=workers, progress=shifted(progress, ready, total))
+            for published in made:
+                assembly.take(published)
+        return assembly.finish(runs=plan.runs, tasks=plan.tasks, label=plan.label)
+
+
+def shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
+    """Progress of some of all parts, told as that of all."""
+    return None if progress is None else lambda done, _: progress(before + done, total)
 
 
 def settle_runs(

@@ -3,7 +3,7 @@
 import math
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,6 @@ from tcmrl_data.operations.assembly import (
 from tcmrl_data.parts.own_operations import SUBSET, Cut
 from tcmrl_data.store.manifest import (
     MANIFEST,
-    Derivation,
     Manifest,
     dataset_folder,
     read_manifest,
@@ -130,24 +129,27 @@ def derive_dataset(
     plan = plan_subset(opened, choice, label=label)
     target = Path(out if out is not None else view or "")
     root = None
-    if view is not None:
-        _write_view(plan, target, dry_run=dry_run)
-    elif dry_run:
+    if view is not None and plan.num_cut:
+        raise SelectionError(
+            "--view: a view names whole parts; use --out for parts that lose episodes or arrays"
+        )
+    if view is not None and not dry_run:
+        root = write_view(plan, target)
+    elif not dry_run:
+        root = carry_out(plan, target, progress).root
+    elif view is None:
         check_out(target, plan.derivation)
-    else:
-        carry_out(plan, target, progress)
-    if not dry_run:
-        root = (read_manifest(target) if view is None else open_dataset(target).manifest).root
     return summary(plan, target, root=root, far=_far_from_medium(plan, rule))
 
 
 def summary(plan: Plan, out: Path, *, root: str | None, far: dict[str, float] | None = None) -> Derived:
     """What is said of a planned or made dataset."""
+    size = sum(part.source.entry(part.source_key).size for part in plan.parts)
     return Derived(
         out=out,
         parts=len(plan.parts),
         cut=plan.num_cut,
-        bytes=plan.bytes if root is None or out.is_file() else read_manifest(out).totals.bytes,
+        bytes=size if root is None or out.is_file() else read_manifest(out).totals.bytes,
         tasks=len(plan.tasks),
         test_tasks=tuple(task.index for task in plan.tasks if task.split == "test"),
         steps=tuple(sorted({part.key.step for part in plan.parts})),
@@ -165,18 +167,6 @@ def describe_far(far: dict[str, float]) -> str:
     return "; ".join(named) + more
 
 
-def _write_view(plan: Plan, file: Path, *, dry_run: bool) -> None:
-    if plan.num_cut:
-        raise SelectionError(
-            "--view: a view names whole parts; use --out for parts that lose episodes or arrays"
-        )
-    if not dry_run:
-        (source,) = plan.sources
-        write_view(
-            file, source, [part.key for part in plan.parts], derivation=plan.derivation, label=plan.label
-        )
-
-
 def _far_from_medium(plan: Plan, rule: str) -> dict[str, float]:
     if "medium" not in rule:
         return {}
@@ -185,36 +175,26 @@ def _far_from_medium(plan: Plan, rule: str) -> dict[str, float]:
     return {str(key): score for key, score in scores.items() if abs(score - MEDIUM_SCORE) > TOLERANCE}
 
 
-def write_view(
-    file: Path,
-    source: Dataset,
-    keys: Iterable[PartKey],
-    *,
-    derivation: Derivation,
-    label: str | None,
-) -> None:
-    """Writes a view.
-
-    Args:
-        file: of the view; its name ends in `.json`.
-        keys: parts of the source, at least one.
+def write_view(plan: Plan, file: Path) -> str:
+    """Writes the view of the whole parts of a plan's one source; returns its root.
 
     Raises:
         StoreError: the file exists, its name is none for a view, or the view would be too large.
     """
+    (source,) = plan.sources
     if not is_view_file(file):
         raise StoreError(f"--view {file}: a view is a file whose name ends in .json, and is not {MANIFEST}")
     if os.path.lexists(file):
         raise StoreError(f"--view {file} exists; choose another name or remove it")
     folder = source.path_on_disk if source.remote else source.folder
-    chosen = set(keys)
+    chosen = {part.key for part in plan.parts}
     table = source.parts.only(chosen)
     fields = {
         "schema_version": VIEW_SCHEMA,
         "source": os.path.relpath(folder.resolve(), file.parent.resolve()),
         "source_root": source.sealed_root,
-        "label": label,
-        "derivation": derivation.model_dump(mode="json"),
+        "label": plan.label,
+        "derivation": plan.derivation.model_dump(mode="json"),
         "totals": totals_of(table).model_dump(),
         "root": table.root,
         "parts": [group.model_dump(mode="json") for group in _groups(chosen)],
@@ -225,6 +205,7 @@ def write_view(
     except ValueError as error:
         raise StoreError(f"--view {file}: too many parts for a view ({error}); use --out instead") from None
     replace_file(file, data)
+    return table.root
 
 
 def _groups(keys: set[PartKey]) -> Iterator[ViewedParts]:
@@ -283,16 +264,7 @@ _SHARE = re.compile(r"(\d{1,3}(?:\.\d+)?)%")
 
 @dataclass(frozen=True)
 class Choice:
-    """What a subset takes of a dataset; nothing is left out by default.
-
-    Attributes:
-        episodes: of each part, a number or a share such as `50%`.
-        seed: draws the episodes; None takes the first.
-        min_return: only episodes whose undiscounted return reaches it.
-        drop_arrays: extra arrays that are left out.
-        held_out: chosen tasks that become its test tasks, and all others its training tasks; empty leaves
-            splits as they are.
-    """
+    """What a subset takes of a dataset, as `derive_dataset` is told; nothing is left out by default."""
 
     snapshots: str = "all"
     tasks: tuple[int, ...] | None = None
@@ -345,8 +317,6 @@ def plan_subset(source: Dataset, choice: Choice, *, label: str | None = None) ->
     cut_runs = {part.key.run for part in parts if part.operation}
     settings = choice.to_json() | _scores(source, choice.snapshots, [task.index for task in tasks])
     return Plan(
-        name=source.name,
-        data_version=source.manifest.data_version,
         runs=settle_runs(source.manifest.runs, [part.key for part in parts], tasks, cut=cut_runs),
         tasks=tasks,
         parts=tuple(parts),

@@ -1,30 +1,36 @@
 """Further episodes from the policies that a dataset stores, without training."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from tcmrl_data.building.work_files import check_work_files
 from tcmrl_data.dataset.dataset import Dataset, open_dataset
-from tcmrl_data.foundation.errors import BuildError
+from tcmrl_data.foundation.disk import LOCK, lock_file, remove_abandoned
+from tcmrl_data.foundation.errors import BuildError, StoreError
 from tcmrl_data.operations.apply import (
-    Pair,
-    add_parts,
     check_parts,
-    jobs_of_pairs,
     keys_of_run,
-    make_of_parts,
     nearest_pairs,
-    runs_like,
     runs_of_pairs,
     simulated_run,
 )
-from tcmrl_data.operations.assembly import derivation_of
-from tcmrl_data.parts.jobs import DeriveSpec
+from tcmrl_data.operations.assembly import Plan, PlannedPart, Progress, carry_out, derivation_of
+from tcmrl_data.parts.jobs import DeriveSpec, Job, derive_parts
+from tcmrl_data.parts.making import numbered
 from tcmrl_data.parts.own_operations import EXTEND, MAX_NOISE
 from tcmrl_data.recipe.recipe import Rollouts
-from tcmrl_data.store.manifest import Run
-from tcmrl_data.store.tables import MAIN_RUN
+from tcmrl_data.store.manifest import Manifest, Run, manifest_bytes, read_manifest, write_manifest
+from tcmrl_data.store.part_table import PARTS_TABLE, part_line
+from tcmrl_data.store.tables import (
+    MAIN_RUN,
+    MAX_PARTS,
+    MAX_PLATFORMS,
+    MAX_RUNS,
+    TableWriter,
+    read_sealed,
+)
 
 
 @dataclass(frozen=True)
@@ -59,7 +65,7 @@ def extend_dataset(
     allow_drift: bool = False,
     workers: int | None = None,
     dry_run: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> ExtendReport:
     """Lets the policies of stored parts act again, with the next of their keyed seeds.
 
@@ -104,21 +110,20 @@ def extend_dataset(
     pairs = [(task, task) for task in acting]
     if cross:
         pairs = nearest_pairs(dataset.tasks, [task for task in dataset.tasks if task.index in acting], cross)
-    names = runs_of_pairs(pairs, run)
-    jobs = jobs_of_pairs(names, keys)
-    check_parts(dataset, source, sorted({job.source for job in jobs}), policy=True, allow_drift=allow_drift)
     common = {"first_episode": first, "noise": float(noise)}
     origin = {"operation": EXTEND, "of": of, **common, "cross": cross}
     template = Run(name=run, kind="extended", seed=seed, recipe=recipe, origin=origin, steps=None)
-    runs = _with_runs(dataset, template, names)
+    extended, jobs = runs_of_pairs(pairs, keys, template)
+    check_parts(dataset, source, sorted({job.source for job in jobs}), policy=True, allow_drift=allow_drift)
+    runs = _with_runs(dataset, extended, jobs)
     new = tuple(job for job in jobs if job.key not in dataset.parts)
     target = dataset.path_on_disk if out is None else out
-    counts = (tuple(sorted(set(names.values()))), len(new), len(jobs) - len(new), episodes)
+    counts = (tuple(sorted(run.name for run in extended)), len(new), len(jobs) - len(new), episodes)
     if dry_run or (out is None and not new):
         return ExtendReport(target, *counts, None if dry_run else dataset.manifest.root)
     spec = DeriveSpec(dataset.path_on_disk, target, EXTEND, common, recipe, seed, new)
     if out is None:
-        manifest = add_parts(dataset, spec, runs=runs, workers=workers, progress=progress)
+        manifest = _add_parts(dataset, spec, runs=runs, workers=workers, progress=progress)
     else:
         recorded = {
             **origin,
@@ -126,16 +131,10 @@ def extend_dataset(
             "snapshots": snapshots,
             "tasks": tasks if tasks is None else sorted(set(tasks)),
         }
-        manifest = make_of_parts(
-            dataset,
-            out,
-            spec,
-            derivation=derivation_of(EXTEND, recorded, [dataset]),
-            runs=runs,
-            with_old=True,
-            workers=workers,
-            progress=progress,
-        )
+        derivation = derivation_of(EXTEND, recorded, [dataset])
+        old = [PlannedPart(key, dataset, key) for key in dataset.parts]
+        plan = Plan(runs, dataset.tasks, old, derivation, [dataset], spec=spec)
+        manifest = carry_out(plan, out, progress, workers=workers)
     return ExtendReport(target, *counts, manifest.root)
 
 
@@ -152,11 +151,11 @@ def _check_numbers(dataset: Dataset, lanes: int, episodes: int, first: int, nois
         raise BuildError(f"--cross {cross} is negative; choose a number of tasks")
 
 
-def _with_runs(dataset: Dataset, template: Run, names: Mapping[Pair, str]) -> list[Run]:
+def _with_runs(dataset: Dataset, extended: Sequence[Run], jobs: Sequence[Job]) -> list[Run]:
     runs = {run.name: run for run in dataset.manifest.runs}
-    for new in runs_like(template, names):
+    for new in extended:
         old = runs.get(new.name)
-        made = {to: task for (task, to), name in names.items() if name == new.name}
+        made = {job.key.task: job.source.task for job in jobs if job.key.run == new.name}
         held = {key.task for key in dataset.parts if key.run == new.name}
         known = dict(old.sources if old else ())
         merged = new.model_copy(update={"sources": tuple(sorted((known | dict(new.sources)).items()))})
@@ -170,3 +169,57 @@ def _with_runs(dataset: Dataset, template: Run, names: Mapping[Pair, str]) -> li
             )
         runs[new.name] = merged
     return list(runs.values())
+
+
+def _add_parts(
+    dataset: Dataset,
+    spec: DeriveSpec,
+    *,
+    runs: Sequence[Run],
+    workers: int | None,
+    progress: Progress | None,
+) -> Manifest:
+    """Makes parts in the dataset's own folder; they belong to it as soon as the new manifest is there.
+
+    The lines of the parts are forced to disk before the manifest that seals them. A crash leaves the dataset
+    as it was, with files of parts that the same command finds again.
+    """
+    folder, manifest = dataset.folder, dataset.manifest
+    if dataset.path != folder:
+        raise StoreError(
+            f"{dataset.path} is a view, to which no parts can be added; name a new dataset by --out"
+        )
+    check_work_files(folder)
+    with lock_file(folder / LOCK, f"dataset {folder}"):
+        remove_abandoned(folder)
+        if read_manifest(folder).digest != manifest.digest:
+            raise StoreError(f"{folder} has changed meanwhile; run the same command again")
+        platforms = list(manifest.platforms)
+        made = derive_parts(spec, workers=workers, progress=progress)
+        entries = sorted(numbered(made, platforms), key=lambda entry: entry.key)
+        recorded = dataset.recorded_parts.with_entries(entries)
+        for what, found, limit in (
+            ("parts", len(recorded), MAX_PARTS),
+            ("runs", len(runs), MAX_RUNS),
+            ("platforms", len(platforms), MAX_PLATFORMS),
+        ):
+            if found > limit:
+                raise BuildError(
+                    f"{folder} would have {found} {what}, more than the {limit} that are allowed"
+                )
+        table = TableWriter(folder / PARTS_TABLE, read_sealed(folder / PARTS_TABLE, manifest.parts))
+        table.append(b"".join(map(part_line, entries)))
+        table.sync()
+        data = manifest_bytes(
+            label=manifest.label,
+            data_version=manifest.data_version,
+            runs=runs,
+            derivation=manifest.derivation,
+            platforms=platforms,
+            tasks=manifest.tasks,
+            parts=table.seal,
+            dropped=manifest.dropped,
+            kept=recorded.without_tasks(manifest.dropped),
+        )
+        write_manifest(folder, data)
+        return read_manifest(folder)

@@ -181,8 +181,6 @@ def plan_merge(
     }
     keys = [part.key for part in parts]
     return Plan(
-        name=ordered[0].name,
-        data_version=ordered[0].manifest.data_version,
         runs=settle_runs([run.run(name) for name, run in merged.items()], keys, tasks),
         tasks=tasks,
         parts=tuple(sorted(parts, key=lambda part: part.key)),

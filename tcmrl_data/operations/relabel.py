@@ -1,8 +1,9 @@
 """Episodes of one task with the rewards of another, where the two differ in rewards alone."""
 
 import contextlib
+import dataclasses
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,15 +13,12 @@ from tcmrl_data.foundation.errors import BuildError, SelectionError
 from tcmrl_data.operations.apply import (
     Pair,
     check_parts,
-    jobs_of_pairs,
     keys_of_run,
-    make_of_parts,
     nearest_pairs,
-    runs_like,
     runs_of_pairs,
     simulated_run,
 )
-from tcmrl_data.operations.assembly import check_out, derivation_of
+from tcmrl_data.operations.assembly import Plan, Progress, carry_out, check_out, derivation_of
 from tcmrl_data.parts.jobs import DeriveSpec
 from tcmrl_data.parts.making import wanted_from
 from tcmrl_data.parts.operation import Simulator, Sources, StoredPart
@@ -58,7 +56,7 @@ def relabel_dataset(
     label: str | None = None,
     workers: int | None = None,
     dry_run: bool = False,
-    progress: Callable[[int, int], None] | None = None,
+    progress: Progress | None = None,
 ) -> RelabelReport:
     """Makes a dataset of stored episodes with the rewards that other tasks give for them.
 
@@ -96,12 +94,10 @@ def relabel_dataset(
     sources = _sources(dataset, tasks, allow_test)
     pairs = _pairs(dataset, sources, to, allow_test)
     keys = keys_of_run(dataset, of, [task.index for task in sources], snapshots)
-    names = runs_of_pairs(pairs, run)
-    jobs = tuple(jobs_of_pairs(names, keys))
-    check_parts(dataset, source, sorted({job.source for job in jobs}), policy=False)
     origin = {"operation": RELABEL, "of": of}
     template = Run(name=run, kind="relabelled", seed=seed, recipe=recipe, origin=origin, steps=None)
-    runs = runs_like(template, names)
+    runs, jobs = runs_of_pairs(pairs, keys, template)
+    check_parts(dataset, source, sorted({job.source for job in jobs}), policy=False)
     if len(runs) > MAX_RUNS:
         raise BuildError(f"{out} would have {len(runs)} runs, more than {MAX_RUNS}; choose fewer --to tasks")
     recorded = {
@@ -121,17 +117,10 @@ def relabel_dataset(
     counts = (tuple(found.name for found in runs), len(pairs), len(jobs), steps)
     if dry_run:
         return RelabelReport(out, *counts, None)
-    manifest = make_of_parts(
-        dataset,
-        out,
-        spec,
-        derivation=derivation,
-        runs=runs,
-        label=label,
-        workers=workers,
-        progress=progress,
-    )
-    return RelabelReport(out, *counts, manifest.root)
+    made = {job.key.task for job in jobs}
+    targets = [task for task in dataset.tasks if task.index in made]
+    plan = Plan(runs, targets, (), derivation, [dataset], label, spec)
+    return RelabelReport(out, *counts, carry_out(plan, out, progress, workers=workers).root)
 
 
 def _sources(dataset: Dataset, tasks: Sequence[int] | None, allow_test: bool) -> list[Task]:
@@ -190,4 +179,4 @@ def _try_out(dataset: Dataset, spec: DeriveSpec) -> None:
         operation = spec.operation_on(dataset, job.source)
         wanted = wanted_from(operation, source, task=task, simulator=simulator)
         with contextlib.closing(simulator):
-            operation.episodes(wanted, Sources(simulator, (source.head(1),)))
+            operation.episodes(wanted, Sources(simulator, (dataclasses.replace(source, first=1),)))

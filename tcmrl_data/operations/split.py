@@ -16,6 +16,7 @@ from tcmrl_data.operations.assembly import (
     check_out,
     derivation_of,
     settle_runs,
+    shifted,
 )
 from tcmrl_data.operations.derive import Derived, summary, write_view
 from tcmrl_data.parts.own_operations import Cut
@@ -78,10 +79,9 @@ def split_dataset(
     before = 0
     for plan, target in waiting if not dry_run else ():
         if views:
-            keys = [part.key for part in plan.parts]
-            write_view(target, opened, keys, derivation=plan.derivation, label=None)
+            write_view(plan, target)
         else:
-            carry_out(plan, target, _shifted(progress, before, total))
+            carry_out(plan, target, shifted(progress, before, total))
         before += len(plan.parts)
     roots = [None if dry_run else open_dataset(target).manifest.root for target in targets]
     made = zip(plans, targets, roots, strict=True)
@@ -106,8 +106,6 @@ def plan_fold(source: Dataset, *, folds: int, seed: int, fold: int) -> Plan:
     keys = tuple(source.parts)
     changed = tuple(replace(task, split=splits[task.index]) for task in tasks)
     return Plan(
-        name=source.name,
-        data_version=source.manifest.data_version,
         runs=settle_runs(source.manifest.runs, keys, tasks),
         tasks=changed,
         parts=tuple(PlannedPart(key, source, key) for key in keys),
@@ -144,8 +142,6 @@ def plan_episodes(source: Dataset, *, first: int, number: int) -> Plan:
         parts.append(PlannedPart(entry.key, source, entry.key, cut))
     keys, cut_runs = [part.key for part in parts], {part.key.run for part in parts if part.operation}
     return Plan(
-        name=source.name,
-        data_version=source.manifest.data_version,
         runs=settle_runs(source.manifest.runs, keys, source.tasks, cut=cut_runs),
         tasks=source.tasks,
         parts=tuple(parts),
@@ -159,10 +155,6 @@ def _plan_episodes(source: Dataset, numbers: tuple[int, ...]) -> Iterator[Plan]:
         raise SelectionError(f"--episodes {numbers}: expected two numbers or more, each at least 1, as 45,5")
     for place, number in enumerate(numbers):
         yield plan_episodes(source, first=sum(numbers[:place]), number=number)
-
-
-def _shifted(progress: Progress | None, before: int, total: int) -> Progress | None:
-    return None if progress is None else lambda done, _: progress(before + done, total)
 
 
 def _is_made(plan: Plan, target: Path) -> bool:

@@ -6,7 +6,6 @@ verify and repair make them again by the same one.
 """
 
 import abc
-import dataclasses
 import functools
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -109,10 +108,6 @@ class StoredPart:
             return unpack(arrays)[: self.first]
         except (StoreError, TrajectoryError) as error:
             raise StoreError(f"{self.place}: {error}; run `tcmrl-data verify --repair`") from None
-
-    def head(self, number: int) -> "StoredPart":
-        """The part as if it had its first episodes alone."""
-        return dataclasses.replace(self, first=number)
 
 
 @final

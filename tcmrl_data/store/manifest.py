@@ -356,7 +356,6 @@ def totals_of(table: PartTable) -> Totals:
 def write_dataset(
     folder: Path,
     *,
-    name: str,
     label: str | None,
     data_version: int,
     runs: Sequence[Run],
@@ -377,7 +376,6 @@ def write_dataset(
     for file, lines in tables.items():
         replace_file(folder / file, lines, staging=folder / STAGING)
     data = manifest_bytes(
-        name=name,
         label=label,
         data_version=data_version,
         runs=runs,
@@ -394,7 +392,6 @@ def write_dataset(
 
 def manifest_bytes(
     *,
-    name: str,
     label: str | None,
     data_version: int,
     runs: Sequence[Run],
@@ -406,9 +403,10 @@ def manifest_bytes(
     kept: PartTable,
 ) -> bytes:
     """The file of a manifest of the given fields; `kept` are the parts of the tasks that are not dropped."""
+    assert runs[0].recipe is not None
     fields = {
         "schema_version": MANIFEST_SCHEMA,
-        "name": name,
+        "name": runs[0].recipe.environment.name,
         "label": label,
         "data_version": data_version,
         "runs": [run.model_dump(mode="json") for run in runs],

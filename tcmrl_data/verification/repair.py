@@ -416,7 +416,6 @@ def write_tables(
     """
     write_dataset(
         folder,
-        name=manifest.name,
         label=manifest.label,
         data_version=manifest.data_version,
         runs=manifest.runs,
