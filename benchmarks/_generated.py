@@ -75,7 +75,7 @@ def plan_noise(
     )
     recipe = tcmrl_data.load_recipe(environment_name, overrides=overrides, behavior="sac")
     chosen = [task for task in choose_tasks(recipe) if task.split == "train"][:tasks]
-    return BuildPlan.of_tasks(recipe, seed=seed, tasks=chosen)
+    return BuildPlan(recipe, seed, tuple(chosen))
 
 
 def noise_part(plan: BuildPlan, task: Task, step: int) -> tuple[PartRecord, bytes]:

@@ -24,7 +24,7 @@ import numpy as np
 import numpy.typing as npt
 
 from tcmrl_data import Recipe, load_recipe
-from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder
+from tcmrl_data.behavior.base import CheckpointFolder
 from tcmrl_data.building.plan import BuildPlan
 from tcmrl_data.envs.base import Task
 from tcmrl_data.parts.operation import Simulator
@@ -39,18 +39,9 @@ Returns = npt.NDArray[np.float64]
 
 def curves(recipe: Recipe, tasks: list[Task], seed: int) -> Returns:
     """Mean returns at the recipe's snapshots after the first, (tasks, snapshots)."""
-    plan = BuildPlan.of_tasks(recipe, seed=seed, tasks=tasks)
-    context = BehaviorContext(
-        environment=plan.environment,
-        tasks=tasks,
-        seed=seed,
-        observation=recipe.behavior.observation,
-        reward=recipe.behavior.reward,
-        report=lambda count: None,
-        checkpoints=lambda tasks: CheckpointFolder(
-            Path(os.devnull), "", key="", missing={}, seconds=math.inf
-        ),
-    )
+    plan = BuildPlan(recipe, seed, tuple(tasks))
+    nowhere = CheckpointFolder(Path(os.devnull), "", key="", missing={}, seconds=math.inf)
+    context = plan.context(lambda count: None, lambda tasks: nowhere)
     found = defaultdict(list)
     for task, snapshot in plan.source.snapshots(context):
         simulator = Simulator(recipe, seed=plan.seed, task=task, environment=plan.environment)

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 
 import tcmrl_data
-from tcmrl_data.building.plan import UnitSpec, run_unit
+from tcmrl_data.building.plan import BuildPlan, UnitSpec, run_unit
 from tcmrl_data.foundation import disk as publish
 from tcmrl_data.foundation import records
 from tcmrl_data.foundation.disk import Disk, make_folders
@@ -55,7 +55,7 @@ def main() -> None:
         dataset = Path(folder).resolve() / "data"
         make_folders(dataset)
         started = time.perf_counter()
-        run_unit(UnitSpec(dataset, recipe, 0, (task,)), lambda message: None)
+        run_unit(UnitSpec(dataset, BuildPlan(recipe, 0, (task,))), lambda message: None)
         seconds = time.perf_counter() - started
         size = sum(path.stat().st_size for path in dataset.rglob("*") if path.is_file())
     shares = {

@@ -30,7 +30,6 @@ from tcmrl_data.envs.point_robot import PointRobotLanes
 from tcmrl_data.envs.rollout import BoolArray, FloatArray
 from tcmrl_data.foundation.disk import LOCK
 from tcmrl_data.foundation.errors import BuildError, ManifestError, StoreError
-from tcmrl_data.recipe.recipe import choose_tasks
 from tcmrl_data.store import archive as archive_module
 from tcmrl_data.store.archive import Archive, pack_archive
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, read_manifest
@@ -279,7 +278,7 @@ def test_a_reward_that_is_not_finite_is_named(
         return done
 
     monkeypatch.setattr(PointRobotLanes, "step", step_with_nan)
-    spec = UnitSpec(tmp_path, tiny_recipe, 0, tuple(choose_tasks(tiny_recipe, [3])))
+    spec = UnitSpec(tmp_path, plan_build(tiny_recipe, tasks=[3]))
     with pytest.raises(BuildError, match="task 3, snapshot step 0, episode 1: rewards are not finite"):
         run_unit(spec, lambda message: None)
 

@@ -167,7 +167,7 @@ def test_a_unit_that_can_write_no_checkpoint_is_done_nevertheless(
     plan = plan_build(tiny_recipe, tasks=[3])
     (tmp_path / CHECKPOINTS).touch()
     messages: list[Mapping[str, Any]] = []
-    made = run_unit(UnitSpec(tmp_path, tiny_recipe, 0, plan.tasks), messages.append)
+    made = run_unit(UnitSpec(tmp_path, plan), messages.append)
     expected = [part_id for (task, _), part_id in part_ids(tiny_folder).items() if task == 3]
     assert made == digest(expected)
     assert [message["kind"] for message in messages].count("warning") == 1
@@ -189,11 +189,11 @@ SAVE_OR_LOAD = """
 import json, sys
 import numpy as np
 from tcmrl_data.behavior.base import TrainingState
-from tcmrl_data.building.plan import BuildPlan, UnitSpec, _checkpoints
+from tcmrl_data.building.plan import UnitSpec, _checkpoints
 from tcmrl_data.foundation.records import from_json
 spec = from_json(UnitSpec, json.loads(sys.argv[2]))
-plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks)
-checkpoints = _checkpoints(spec, plan, spec.tasks, {3: plan.source.steps}, print)
+plan = spec.plan
+checkpoints = _checkpoints(spec, plan.tasks, {3: plan.source.steps}, print)
 if sys.argv[1] == "save":
     checkpoints.save(TrainingState({"steps": -1}, {"weights": np.zeros(2)}))  # before snapshot 0
 print(checkpoints.load() is not None)
@@ -202,7 +202,7 @@ print(checkpoints.load() is not None)
 
 @pytest.mark.check
 def test_a_checkpoint_of_another_platform_is_ignored(tiny_recipe: Recipe, tmp_path: Path) -> None:
-    spec = json.dumps(to_json(UnitSpec(tmp_path, tiny_recipe, 0, plan_build(tiny_recipe, tasks=[3]).tasks)))
+    spec = json.dumps(to_json(UnitSpec(tmp_path, plan_build(tiny_recipe, tasks=[3]))))
     found = [
         subprocess.run(
             [sys.executable, "-c", SAVE_OR_LOAD, command, spec],

@@ -18,7 +18,7 @@ import torch
 import tcmrl_data
 from tcmrl_data import Dataset, Recipe, load_recipe
 from tcmrl_data.building.build import WORKER
-from tcmrl_data.building.plan import UnitSpec
+from tcmrl_data.building.plan import BuildPlan, UnitSpec
 from tcmrl_data.engine import local
 from tcmrl_data.engine.base import ENGINES, BaseEngine, Message, Result, Unit, longest_first
 from tcmrl_data.engine.local import InProcessEngine, LocalEngine
@@ -83,7 +83,7 @@ def make_units(recipe: Recipe, out: Path, tasks: list[int]) -> list[Unit]:
     (out / STAGING).mkdir(parents=True)
     units = []
     for task in choose_tasks(recipe, tasks):
-        spec = UnitSpec(out.resolve(), recipe, 0, (task,))
+        spec = UnitSpec(out.resolve(), BuildPlan(recipe, 0, (task,)))
         units.append(Unit(f"task {task.index}", to_json(spec), WORKER))
     return units
 

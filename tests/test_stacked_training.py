@@ -17,7 +17,7 @@ from tcmrl_data.behavior.base import BehaviorContext, CheckpointFolder, Snapshot
 from tcmrl_data.behavior.stacked import StackedSource
 from tcmrl_data.behavior.stacked_training import GroupTraining
 from tcmrl_data.building.ledger import Ledger
-from tcmrl_data.building.plan import BuildPlan, UnitSpec, plan_build, run_unit
+from tcmrl_data.building.plan import UnitSpec, plan_build, run_unit
 from tcmrl_data.foundation.disk import CHECKPOINTS, make_folders
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.records import canonical_json, to_json
@@ -251,8 +251,7 @@ def test_the_others_of_a_diverged_agents_group_go_on_from_their_checkpoint(
 ) -> None:
     overrides = (*TINY, "behavior.stacked.steps=150", "behavior.stacked.snapshots=[0,100,120,150]")
     recipe = recipe_of(overrides=overrides)
-    plan = plan_build(recipe, tasks=[1, 2, 3])
-    spec = UnitSpec(tmp_path, recipe, 0, plan.tasks)
+    spec = UnitSpec(tmp_path, plan_build(recipe, tasks=[1, 2, 3]))
     monkeypatch.setattr(CheckpointFolder, "is_due", lambda self: True)
     advance, steps = GroupTraining.advance, 0
 
@@ -273,7 +272,7 @@ def test_the_others_of_a_diverged_agents_group_go_on_from_their_checkpoint(
     published = [
         (index, step)
         for index in (1, 2, 3)
-        for step in plan.source.steps
+        for step in spec.plan.source.steps
         if (tmp_path / part_file(PartKey(index, step))).is_file()
     ]
     assert published == [
@@ -324,8 +323,8 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
         "rollouts.episodes=10",
     )
     recipe = load_recipe("half-cheetah-vel", profile="quick", overrides=overrides, behavior="stacked")
-    tasks = choose_tasks(recipe, range(20))
-    spec = canonical_json(to_json(UnitSpec(tmp_path, recipe, 0, tasks))).decode()
+    plan = plan_build(recipe, tasks=range(20))
+    spec = canonical_json(to_json(UnitSpec(tmp_path, plan))).decode()
     program = (
         "import json, re, sys\n"
         "from pathlib import Path\n"
@@ -339,7 +338,7 @@ def test_a_unit_stays_within_its_planned_memory(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-c", program], input=spec, capture_output=True, text=True, check=True
     )
-    planned = BuildPlan.of_tasks(recipe, seed=0, tasks=tasks).unit_bytes(len(tasks))
+    planned = plan.unit_bytes(len(plan.tasks))
     assert 0.4 * planned < int(done.stdout) < planned
 
 

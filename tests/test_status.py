@@ -21,7 +21,7 @@ Copy = Callable[[], Path]
 
 
 def event(kind: str, unit: str | None = None, steps: int = 0, message: str = "") -> BuildEvent:
-    return BuildEvent(kind, unit, 0, 5, 0, 15, steps, 750, message)  # type: ignore[arg-type]
+    return BuildEvent(kind, unit, 0, 15, steps, 750, message)  # type: ignore[arg-type]
 
 
 def test_a_finished_build_says_so(tiny_folder: Path) -> None:

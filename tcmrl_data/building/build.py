@@ -212,8 +212,7 @@ class Driver:
         self._deadline = VISIBLE_SECONDS if engine.takes_address else 0.0
         ledger.begin()
         try:
-            unfinished = len(self._plan.wanted) - ledger.num_tasks_done
-            log.write(self._event("start", f"{unfinished} of {len(self._plan.wanted)} tasks to build"))
+            log.write(self._event("start", f"{ledger.num_missing} parts to build"))
             for remark in remarks:
                 log.write(self._event("warning", remark))
             results = engine.run(
@@ -257,7 +256,7 @@ class Driver:
     def _unit(self, tasks: tuple[Task, ...]) -> Unit:
         """The unit of a group; done and dropped tasks stay in it, since their absence may change rounding."""
         plan = self._plan
-        spec = UnitSpec(self._dataset, plan.recipe, plan.seed, tasks, plan.dropped, self._checkpoint_seconds)
+        spec = UnitSpec(self._dataset, dataclasses.replace(plan, tasks=tasks), self._checkpoint_seconds)
         reserved = plan.recipe.build
         return Unit(
             _unit_id(tasks),
@@ -298,8 +297,6 @@ class Driver:
         return BuildEvent(
             kind=kind,
             unit=unit,
-            tasks_done=self._ledger.num_tasks_done,
-            tasks_total=len(self._plan.wanted),
             parts_done=self._ledger.num_parts,
             parts_total=self._ledger.num_parts + self._ledger.num_missing,
             steps_done=self._steps_done,

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tcmrl_data.behavior.base import BehaviorSource, CheckpointFolder, Snapshot
-from tcmrl_data.building.plan import BuildPlan, PartMaker, UnitSpec
+from tcmrl_data.building.plan import BuildPlan, PartMaker
 from tcmrl_data.engine.base import ENGINES, Unit
 from tcmrl_data.engine.local import Send
 from tcmrl_data.envs.base import Task
@@ -167,7 +167,7 @@ def _measure(plan: BuildPlan, number: int) -> list[Measurement]:
     units = [
         Unit(
             f"probe of task {group[0].index}",
-            to_json(UnitSpec(Path(), plan.recipe, plan.seed, group)),
+            to_json(dataclasses.replace(plan, tasks=group)),
             worker=WORKER,
             timeout=PROBE_TIMEOUT,
         )
@@ -239,23 +239,25 @@ def _rate(marks: list[tuple[float, int]]) -> float:
 
 
 def work(values: dict[str, Any], send: Send) -> str:
-    """Measures the unit of these values and sends what it measured."""
+    """Measures the unit of a plan and sends what it measured; its parts have a single lane batch."""
     import torch
 
     torch.set_num_threads(1)  # as a build's workers
     send({"kind": "started"})
-    spec = from_json(UnitSpec, values)
-    plan = _probe_plan(spec)
+    whole = from_json(BuildPlan, values)
+    rollouts = whole.recipe.rollouts
+    batch = rollouts.model_copy(update={"episodes": rollouts.lanes})
+    plan = dataclasses.replace(whole, recipe=whole.recipe.model_copy(update={"rollouts": batch}))
     source = plan.source.with_warmup(WARMUP_STEPS)
-    clock = Clock(source.warmup_steps * len(spec.tasks))
+    clock = Clock(source.warmup_steps * len(plan.tasks))
     nowhere = CheckpointFolder(Path(os.devnull), "", key="", missing={}, seconds=math.inf)
-    context = spec.context(plan, clock.report, lambda tasks: nowhere)
+    context = plan.context(clock.report, lambda tasks: nowhere)
     started = time.monotonic()
     try:
         for index, (task, snapshot) in enumerate(source.snapshots(context)):
             if index == 0:
                 setup = time.monotonic() - started
-                parts = _measure_parts(spec, plan, task, snapshot)
+                parts = _measure_parts(plan, task, snapshot, batches=rollouts.episodes / rollouts.lanes)
                 clock.restart()
             if index == 1 and not source.training_steps:
                 break
@@ -265,16 +267,13 @@ def work(values: dict[str, Any], send: Send) -> str:
     return ""
 
 
-def _probe_plan(spec: UnitSpec) -> BuildPlan:
-    """The plan of the unit with a single lane batch per part."""
-    rollouts = spec.recipe.rollouts.model_copy(update={"episodes": spec.recipe.rollouts.lanes})
-    recipe = spec.recipe.model_copy(update={"rollouts": rollouts})
-    return BuildPlan.of_tasks(recipe, seed=spec.seed, tasks=spec.tasks)
+def _measure_parts(plan: BuildPlan, task: Task, snapshot: Snapshot, *, batches: float) -> dict[str, float]:
+    """Seconds of a task's first part and of one more, and how many times longer full episodes would be.
 
-
-def _measure_parts(spec: UnitSpec, plan: BuildPlan, task: Task, snapshot: Snapshot) -> dict[str, float]:
-    """Seconds of a task's first part and of one more, and how many times longer full episodes would be."""
-    batches = spec.recipe.rollouts.episodes / plan.recipe.rollouts.episodes
+    Args:
+        plan: with one lane batch per part.
+        batches: number of lane batches of a whole part.
+    """
     seconds = []
     with tempfile.TemporaryDirectory(prefix="tcmrl-probe-") as name:
         maker = PartMaker(Path(name), plan, task=task, behavior={})
@@ -283,7 +282,7 @@ def _measure_parts(spec: UnitSpec, plan: BuildPlan, task: Task, snapshot: Snapsh
             published = maker.publish(dataclasses.replace(snapshot, step=step))
             assert published is not None  # the folder is new
             found = published.entry
-            if len(spec.tasks) > 1:
+            if len(plan.tasks) > 1:
                 maker.close()
             seconds.append((time.monotonic() - started) * batches)
         maker.close()

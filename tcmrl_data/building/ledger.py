@@ -89,7 +89,7 @@ class Ledger:
         self._found: list[Published] = []
         self.damaged: list[Path] = []
         self._steps = {task.index: set[int]() for task in self.plan.wanted}
-        self.num_parts = self.num_tasks_done = 0
+        self.num_parts = 0
         self._sealed, self._seal_seconds = time.monotonic(), 0.0
         self._find_parts(log)
 
@@ -244,10 +244,8 @@ class Ledger:
             raise
 
     def _add(self, key: PartKey) -> None:
-        steps = self._steps[key.task]
-        steps.add(key.step)
+        self._steps[key.task].add(key.step)
         self.num_parts += 1
-        self.num_tasks_done += len(steps) == len(self.plan.source.steps)
 
     def _find_parts(self, log: bytes) -> None:
         """Compares the tables with the files, and finds the parts that the tables do not name."""

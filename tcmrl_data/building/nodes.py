@@ -14,7 +14,8 @@ from tcmrl_data.foundation.disk import STAGING, make_folders, write_file
 from tcmrl_data.foundation.errors import BuildError
 from tcmrl_data.foundation.files import wait_until_visible
 from tcmrl_data.foundation.records import as_model
-from tcmrl_data.store.part import Platform
+from tcmrl_data.recipe.recipe import Recipe
+from tcmrl_data.store.part import Platform, this_platform
 
 WORKER = "tcmrl_data.building.nodes"
 """Module that describes a machine."""
@@ -33,7 +34,7 @@ def check_nodes(engine: BaseEngine, plan: BuildPlan, out: Path) -> tuple[str, ..
     """Checks that every machine of the engine sees the dataset's folder and has the versions of this one.
 
     Args:
-        engine: the build's engine; one that uses this machine alone has nothing to check.
+        engine: the build's engine.
         out: the dataset's folder, locked by the caller.
 
     Returns:
@@ -42,8 +43,6 @@ def check_nodes(engine: BaseEngine, plan: BuildPlan, out: Path) -> tuple[str, ..
     Raises:
         BuildError: names the machines that do not see the folder, have other versions or do not answer.
     """
-    if not engine.takes_address:
-        return ()
     with _token(out) as token:
         reports = engine.run_on_every_node(_unit(plan, token))
     here = Platform.model_validate(plan.platform.model_dump(mode="json"))  # as the other machines send theirs
@@ -136,14 +135,7 @@ def work(spec: dict[str, Any], report: Send) -> str:
     sees = wait_until_visible(Path(spec["token"]), deadline=spec["deadline"])
     report({"kind": "node", "sees_folder": sees, "tcmrl": version("tcmrl")})
     if sees and version("tcmrl") == spec["tcmrl"]:
-        report({"kind": "platform", "platform": _own_platform(spec["recipe"])})
+        recipe = as_model(Recipe, spec["recipe"])
+        platform = this_platform(recipe.make_environment(), recipe.behavior.source)
+        report({"kind": "platform", "platform": platform.model_dump(mode="json")})
     return ""
-
-
-def _own_platform(recipe: dict[str, Any]) -> dict[str, Any]:
-    from tcmrl_data.recipe.recipe import Recipe
-    from tcmrl_data.store.part import this_platform
-
-    resolved = as_model(Recipe, recipe)
-    platform = this_platform(resolved.make_environment(), resolved.behavior.source)
-    return platform.model_dump(mode="json")

@@ -44,7 +44,7 @@ PART_COPIES = 4
 
 @dataclass(frozen=True)
 class BuildPlan:
-    """What a build, its driver and its workers share.
+    """What a build, its driver and its workers share; without what is made of it, it goes to workers as JSON.
 
     Attributes:
         tasks: the tasks to build, ascending by index.
@@ -54,16 +54,13 @@ class BuildPlan:
 
     recipe: Recipe
     seed: int
-    environment: Environment
     tasks: tuple[Task, ...]
     dropped: frozenset[int] = frozenset()
 
-    @classmethod
-    def of_tasks(
-        cls, recipe: Recipe, *, seed: int, tasks: Iterable[Task], dropped: Iterable[int] = ()
-    ) -> "BuildPlan":
-        """The plan of a recipe for tasks that are known already."""
-        return cls(recipe, seed, recipe.make_environment(), _ordered(tasks), frozenset(dropped))
+    @functools.cached_property
+    def environment(self) -> Environment:
+        """The recipe's environment."""
+        return self.recipe.make_environment()
 
     @functools.cached_property
     def wanted(self) -> tuple[Task, ...]:
@@ -111,6 +108,21 @@ class BuildPlan:
         """The platform of this process for the plan's environment and behavior source."""
         return this_platform(self.environment, self.recipe.behavior.source)
 
+    def context(
+        self, report: Callable[[int], None], checkpoints: Callable[[Sequence[Task]], CheckpointFolder]
+    ) -> BehaviorContext:
+        """What the behavior source receives to make the policies of the tasks."""
+        behavior = self.recipe.behavior
+        return BehaviorContext(
+            self.environment,
+            self.tasks,
+            self.seed,
+            behavior.observation,
+            behavior.reward,
+            report,
+            checkpoints,
+        )
+
     @property
     def part_bytes(self) -> int:
         """Size of a part's arrays before compression, for episodes of full length."""
@@ -156,7 +168,7 @@ def plan_build(
             recipe, sorted({*dropped} - {task.index for task in chosen}), environment=environment
         )
         chosen += others
-    return BuildPlan(recipe, seed, environment, _ordered(chosen), frozenset(dropped))
+    return BuildPlan(recipe, seed, _ordered(chosen), frozenset(dropped))
 
 
 @dataclass(frozen=True)
@@ -164,35 +176,13 @@ class UnitSpec:
     """What a worker is told, as JSON.
 
     Attributes:
-        tasks: the unit's tasks, which are trained together.
-        dropped: indices of tasks of which no parts are made.
+        plan: of the unit's tasks, which are trained together.
         checkpoint_seconds: least time between two checkpoints of behavior training.
     """
 
     dataset: Path
-    recipe: Recipe
-    seed: int
-    tasks: tuple[Task, ...]
-    dropped: frozenset[int] = frozenset()
+    plan: BuildPlan
     checkpoint_seconds: float = CHECKPOINT_SECONDS
-
-    def context(
-        self,
-        plan: BuildPlan,
-        report: Callable[[int], None],
-        checkpoints: Callable[[Sequence[Task]], CheckpointFolder],
-    ) -> BehaviorContext:
-        """What the behavior source receives to make the policies of the unit."""
-        behavior = self.recipe.behavior
-        return BehaviorContext(
-            plan.environment,
-            self.tasks,
-            self.seed,
-            behavior.observation,
-            behavior.reward,
-            report,
-            checkpoints,
-        )
 
 
 def run_unit(spec: UnitSpec, report: Send) -> str:
@@ -204,12 +194,14 @@ def run_unit(spec: UnitSpec, report: Send) -> str:
     Raises:
         NondeterminismError: a part published on an equal platform has another policy.
     """
-    plan = BuildPlan.of_tasks(spec.recipe, seed=spec.seed, tasks=spec.tasks, dropped=spec.dropped)
-    missing = {task.index: _missing_steps(spec, plan.source, task) for task in plan.wanted}
-    missing = {index: steps for index, steps in missing.items() if steps}
-    if missing:
-        _make_parts(spec, plan, missing, report)
+    plan = spec.plan
     keys = [PartKey(task.index, step) for task in plan.wanted for step in plan.source.steps]
+    missing: dict[int, list[int]] = {}
+    for key in keys:
+        if not (spec.dataset / part_file(key)).exists():
+            missing.setdefault(key.task, []).append(key.step)
+    if missing:
+        _make_parts(spec, missing, report)
     return digest([_part_id(spec.dataset / part_file(key)) for key in keys])
 
 
@@ -272,12 +264,11 @@ def _part_id(file: Path) -> str:
         return read_part_record(archive).id
 
 
-def _make_parts(spec: UnitSpec, plan: BuildPlan, missing: Mapping[int, Sequence[int]], report: Send) -> None:
-    source = plan.source
-    context = spec.context(
-        plan,
+def _make_parts(spec: UnitSpec, missing: Mapping[int, Sequence[int]], report: Send) -> None:
+    plan, source = spec.plan, spec.plan.source
+    context = plan.context(
         lambda count: report({"kind": "steps", "count": count}),
-        lambda tasks: _checkpoints(spec, plan, tasks, missing, report),
+        lambda tasks: _checkpoints(spec, tasks, missing, report),
     )
     recorded = source.provenance()
     with contextlib.ExitStack() as stack:
@@ -294,29 +285,19 @@ def _make_parts(spec: UnitSpec, plan: BuildPlan, missing: Mapping[int, Sequence[
             # simulators of many tasks would fill the memory: a group makes them anew for every part
             if snapshot.step == source.steps[-1] or len(missing) > 1:
                 makers[task.index].close()
-    _checkpoints(spec, plan, spec.tasks, missing, report).clear()
-
-
-def _missing_steps(spec: UnitSpec, source: BehaviorSource, task: Task) -> list[int]:
-    return [
-        step for step in source.steps if not (spec.dataset / part_file(PartKey(task.index, step))).exists()
-    ]
+    _checkpoints(spec, plan.tasks, missing, report).clear()
 
 
 def _checkpoints(
-    spec: UnitSpec,
-    plan: BuildPlan,
-    tasks: Sequence[Task],
-    missing: Mapping[int, Sequence[int]],
-    report: Send,
+    spec: UnitSpec, tasks: Sequence[Task], missing: Mapping[int, Sequence[int]], report: Send
 ) -> CheckpointFolder:
     """Where the tasks' training keeps its state; bound to everything that the training depends on."""
     key = {
         "data_version": DATA_VERSION,
-        "settings": spec.recipe.unit_settings(),
-        "seed": spec.seed,
+        "settings": spec.plan.recipe.unit_settings(),
+        "seed": spec.plan.seed,
         "tasks": [task.index for task in tasks],
-        "platform": plan.platform.digest(),
+        "platform": spec.plan.platform.digest(),
     }
     return CheckpointFolder(
         spec.dataset,

@@ -92,8 +92,7 @@ WINDOW_SECONDS = 60
 """Training speed is measured over this time."""
 
 MAX_MESSAGES = 100
-MAX_RUNNING = 10_000
-"""Of more failures, warnings or running units the latest are kept."""
+"""Of more failures or warnings the latest are kept."""
 
 MESSAGE_CHARACTERS = 1_000
 """A longer message is cut in the status."""
@@ -111,8 +110,6 @@ class BuildEvent:
 
     kind: EventKind
     unit: str | None
-    tasks_done: int
-    tasks_total: int
     parts_done: int
     parts_total: int
     steps_done: int
@@ -163,8 +160,6 @@ class StatusFile:
             self._running.pop(event.unit or "", None)
         elif event.unit:
             self._running[event.unit] = None
-            if len(self._running) > MAX_RUNNING:
-                del self._running[next(iter(self._running))]
         if event.kind == "unit_failed":
             self._failed.append(message)
             self._num_failed += 1
