@@ -8,7 +8,7 @@ import pytest
 
 from tcmrl_data import Dataset, merge_datasets, open_dataset, repair_dataset, verify_dataset
 from tcmrl_data.foundation.errors import BuildError, SelectionError
-from tcmrl_data.foundation.records import canonical_json, sha256
+from tcmrl_data.foundation.records import Record, canonical_json, sha256
 from tcmrl_data.operations.apply import apply_operation
 from tcmrl_data.parts.making import make_from
 from tcmrl_data.parts.operation import OPERATIONS, Operation, Simulator, Sources, StoredPart, WantedPart
@@ -78,7 +78,7 @@ def test_imported_episodes_cannot_be_made_again(tiny: Dataset) -> None:
     identity = tiny.part(*tiny.parts.keys_of(0)[0]).identity.model_copy(update={"seed": None})
     assert isinstance(operation_of(identity, "here"), Import)
     with pytest.raises(BuildError, match="its seed or its policy is not known"):
-        Import().episodes(WantedPart({}, tiny.task(0), 0), Sources())
+        Import(Record()).episodes(WantedPart({}, tiny.task(0), 0), Sources())
 
 
 @pytest.mark.usefixtures("in_process")

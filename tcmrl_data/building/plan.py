@@ -18,7 +18,7 @@ from tcmrl_data.behavior.base import (
 from tcmrl_data.engine.local import Send
 from tcmrl_data.envs.base import Environment, Task
 from tcmrl_data.foundation.errors import NondeterminismError, TaskError
-from tcmrl_data.foundation.records import digest, from_json
+from tcmrl_data.foundation.records import Record, digest, from_json
 from tcmrl_data.parts.making import Published, make_part, one_thread, publish, read_published
 from tcmrl_data.parts.operation import Simulator, Sources, WantedPart
 from tcmrl_data.parts.own_operations import Rollout, measure_references
@@ -247,7 +247,7 @@ class PartMaker:
         simulator = self._simulator
         settings = simulator.recipe.unit_settings()
         wanted = WantedPart(settings, simulator.task, snapshot.step, simulator.seed, snapshot)
-        episodes = Rollout().make(wanted, Sources(simulator))
+        episodes = Rollout(Record()).make(wanted, Sources(simulator))
         if self._references is None:
             self._references = measure_references(simulator)
         return make_part(

@@ -191,7 +191,7 @@ def publish_folder(root: Path, target: Path, files: Mapping[str, bytes], *, atte
     staging = root / STAGING
     _make_staging(staging)
     staged = staging / f"{attempt}.{uuid.uuid4().hex}"
-    with lock_file(staged.with_name(f"{staged.name}.lock"), "this attempt") as lock:
+    with lock_file(_attempt_lock(staged), "this attempt") as lock:
         try:
             folders = {staged, *(staged / parent for name in files for parent in Path(name).parents)}
             with named_errors(staged):
@@ -320,26 +320,34 @@ def _holder(file: IO[Any]) -> str:
     return os.pread(file.fileno(), 200, 0).decode(errors="replace").strip() or "another process"
 
 
-def remove_abandoned(root: Path) -> list[str]:
-    """Removes staged attempts whose process has ended, and returns their names.
+def abandoned(root: Path) -> list[Path]:
+    """What processes that have ended left in the staging folder; the locks of attempts go with them.
 
-    The caller must be the only writer. A process creates an attempt after the attempt's lock and removes it
-    before the lock, so an attempt without a lock is abandoned. A single staged file belongs to the caller,
-    or to a worker whose driver has ended.
+    A process creates an attempt after the attempt's lock and removes it before the lock, so an attempt
+    without a lock is abandoned. A single staged file belongs to the caller, who must be the only writer, or
+    to a worker whose driver has ended.
     """
     staging = root / STAGING
-    removed = []
-    for lock in sorted(staging.glob("*.lock")) if staging.is_dir() else []:
-        with contextlib.suppress(LockedError), lock_file(lock, lock.name):
-            remove_tree(lock.with_suffix(""))
-            lock.unlink()
-            removed.append(lock.stem)
+    found = []
     for path in sorted(staging.iterdir()) if staging.is_dir() else []:
-        if path.suffix == ".lock" or path.with_name(f"{path.name}.lock").exists():
-            continue
+        is_lock = path.suffix == ".lock"
+        if lock_holder(path if is_lock else _attempt_lock(path)) is None:
+            found += [] if is_lock and path.with_suffix("").exists() else [path]
+    return found
+
+
+def remove_abandoned(root: Path) -> None:
+    """Removes what is abandoned in the staging folder."""
+    for path in abandoned(root):
         if path.is_dir():
             remove_tree(path)
-        else:
+        elif path.suffix != ".lock":
             path.unlink(missing_ok=True)  # its owner may have removed it meanwhile
-        removed.append(path.name)
-    return removed
+        lock = path if path.suffix == ".lock" else _attempt_lock(path)
+        if lock.exists():
+            with contextlib.suppress(LockedError), lock_file(lock, lock.name):
+                lock.unlink()
+
+
+def _attempt_lock(path: Path) -> Path:
+    return path.with_name(f"{path.name}.lock")

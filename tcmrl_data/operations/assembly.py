@@ -22,14 +22,14 @@ from tcmrl_data.foundation.disk import (
 )
 from tcmrl_data.foundation.errors import StoreError
 from tcmrl_data.foundation.files import read_plain_file
-from tcmrl_data.foundation.records import canonical_json, sha256, write_ranges
+from tcmrl_data.foundation.records import canonical_json, write_ranges
 from tcmrl_data.parts.jobs import DeriveSpec, derive_parts
 from tcmrl_data.parts.making import Published, make_from, numbered, publish
 from tcmrl_data.parts.operation import Operation, StoredPart, can_be_made_again
 from tcmrl_data.store.archive import LARGEST_ARCHIVE
 from tcmrl_data.store.manifest import Derivation, Manifest, Run, Source, write_dataset
 from tcmrl_data.store.part import DATA_VERSION, PartRecord, Platform
-from tcmrl_data.store.part_table import PartEntry, PartTable
+from tcmrl_data.store.part_table import PartEntry, PartTable, read_part
 from tcmrl_data.store.tables import MAX_PARTS, PartKey, part_file
 
 Progress = Callable[[int, int], None]
@@ -185,9 +185,10 @@ class Assembly:
 def holds_part(file: Path, entry: PartEntry) -> bool:
     """Whether a part is in its place; after a crash its file may hold anything."""
     try:
-        return sha256(read_plain_file(file, limit=entry.size)) == entry.sha256
-    except (OSError, ValueError):
+        read_part(file, entry)
+    except StoreError:
         return False
+    return True
 
 
 @contextlib.contextmanager

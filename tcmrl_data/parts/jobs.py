@@ -106,26 +106,23 @@ def derive_parts(
     return [parts[key] for key in sorted(parts)]
 
 
-def publish_jobs(spec: DeriveSpec, report: Send) -> str:
-    """Makes every missing part of the jobs, those of a task with one simulator.
-
-    Returns:
-        A digest over the ids of the parts.
-    """
-    dataset = open_dataset(spec.source)
-    ids = []
-    for index in sorted({job.key.task for job in spec.jobs}):
-        with contextlib.ExitStack() as stack:
-            simulator = None
-            if operation_named(spec.operation).simulates:
-                assert spec.seed is not None  # the driver saw to it
-                simulator = Simulator(spec.recipe, seed=spec.seed, task=dataset.task(index))
-                stack.callback(simulator.close)
-            for job in spec.jobs:
-                if job.key.task == index:
-                    published = _publish(spec, dataset, job, simulator)
-                    report(published.to_message())
-                    ids.append(published.entry.id)
+def work(values: dict[str, Any], report: Send) -> str:
+    """Makes every missing part of some jobs, those of a task with one simulator; the digest of all ids."""
+    spec = from_json(DeriveSpec, values)
+    dataset, ids = open_dataset(spec.source), []
+    with one_thread():
+        for index in sorted({job.key.task for job in spec.jobs}):
+            with contextlib.ExitStack() as stack:
+                simulator = None
+                if operation_named(spec.operation).simulates:
+                    assert spec.seed is not None  # the driver saw to it
+                    simulator = Simulator(spec.recipe, seed=spec.seed, task=dataset.task(index))
+                    stack.callback(simulator.close)
+                for job in spec.jobs:
+                    if job.key.task == index:
+                        published = _publish(spec, dataset, job, simulator)
+                        report(published.to_message())
+                        ids.append(published.entry.id)
     return digest(ids)
 
 
@@ -145,9 +142,3 @@ def references_of(dataset: Dataset, task: int) -> References:
     if not entries:
         return NO_REFERENCES
     return References(**{name: getattr(entries[0], name) for name in REFERENCES})
-
-
-def work(values: dict[str, Any], report: Send) -> str:
-    """Makes and publishes the parts of some jobs; the digest of their ids."""
-    with one_thread():
-        return publish_jobs(from_json(DeriveSpec, values), report)

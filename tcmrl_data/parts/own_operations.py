@@ -49,9 +49,6 @@ class Rollout(Operation[Record]):
     simulates = True
     own_seeds = True
 
-    def __init__(self, settings: Record | None = None) -> None:
-        super().__init__(settings or Record())
-
     def episodes(self, wanted: WantedPart, sources: Sources) -> list[Trajectory]:
         """The episodes 0, 1, … of the policy's keyed seeds."""
         return act(_policy_of(wanted), sources.running, parameters=wanted.task.parameters)
@@ -406,9 +403,6 @@ class Import(Operation[Record]):
     kinds = ("imported", "recorded")
     Settings = Record
 
-    def __init__(self, settings: Record | None = None) -> None:
-        super().__init__(settings or Record())
-
     def episodes(self, wanted: WantedPart, sources: Sources) -> list[Trajectory]:
         """Raises."""
         raise BuildError("its seed or its policy is not known")
@@ -439,7 +433,8 @@ def operation_of(identity: Identity, place: str) -> Operation[Any]:
     """
     derived = identity.derived
     if derived is None:
-        return Import() if identity.seed is None or identity.policy is None else Rollout()
+        unknown = identity.seed is None or identity.policy is None
+        return (Import if unknown else Rollout)(Record())
     kind = operation_named(str(derived.get("operation"))[:64])
     try:
         return kind(as_model(kind.Settings, derived.get("settings")))

@@ -68,9 +68,6 @@ def pack_archive(files: Mapping[str, bytes]) -> bytes:
 class Archive:
     """An opened archive; contents are checked as they are read. Threads may read side by side.
 
-    Attributes:
-        sizes: name to bytes of every member, in the order of the file.
-
     Example:
         >>> import tempfile
         >>> path = Path(tempfile.mkdtemp()) / "part.zip"
@@ -96,7 +93,6 @@ class Archive:
         except BaseException:
             self.close()
             raise
-        self.sizes: Mapping[str, int] = {name: member.file_size for name, member in self._members.items()}
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -21,6 +21,7 @@ from tcmrl_data.foundation.disk import (
     CHECKPOINTS,
     LOCK,
     STAGING,
+    abandoned,
     disk,
     lock_file,
     lock_holder,
@@ -32,7 +33,6 @@ from tcmrl_data.foundation.errors import BuildError, LockedError, StoreError
 from tcmrl_data.store.manifest import MANIFEST, MANIFEST_COPY, dataset_folder, read_manifest
 from tcmrl_data.store.tables import PARTS, is_part_folder, key_of_file
 from tcmrl_data.verification.description import Scan, scan_dataset
-from tcmrl_data.verification.repair import REPAIR
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ def collect_garbage(path: str | Path, *, dry_run: bool = False) -> tuple[Garbage
         if not dry_run:
             remove_abandoned(folder)
             for item in found:
-                if item.path.startswith(CHECKPOINTS) or item.path == f"{STAGING}/{REPAIR}":
+                if item.path.startswith(CHECKPOINTS):
                     remove_tree(folder / item.path)
     return found
 
@@ -83,18 +83,11 @@ def _idle(folder: Path, *, dry_run: bool) -> Iterator[None]:
 
 
 def _garbage(folder: Path) -> tuple[Garbage, ...]:
-    staging, checkpoints = folder / STAGING, folder / CHECKPOINTS
-    found = []
-    for path in sorted(staging.iterdir()) if staging.is_dir() else []:
-        lock = path.with_name(f"{path.name}.lock")
-        if path.suffix == ".lock":
-            is_abandoned = lock_holder(path) is None and not path.with_suffix("").exists()
-        elif path.is_dir():
-            is_abandoned = path.name == REPAIR or (lock.exists() and lock_holder(lock) is None)
-        else:
-            is_abandoned = True
-        if is_abandoned:
-            found.append(Garbage(f"{STAGING}/{path.name}", "abandoned by a build that ended", _size(path)))
+    checkpoints = folder / CHECKPOINTS
+    found = [
+        Garbage(f"{STAGING}/{path.name}", "abandoned by a build that ended", _size(path))
+        for path in abandoned(folder)
+    ]
     is_done = _done_tasks(folder)
     for path in sorted(checkpoints.iterdir()) if checkpoints.is_dir() else []:
         tasks = checkpoint_tasks(path.name)

@@ -94,14 +94,36 @@ class PartChecks:
             return
         if record.platform != self._description.manifest.platforms[entry.platform]:
             yield "was made on another platform than the dataset says"
-        yield from _identity_problems(
-            record,
-            entry=entry,
-            task=task,
-            run=run,
-            settings=self._settings.get(entry.run),
-            data_version=self._description.manifest.data_version,
-        )
+        yield from self._identity_problems(record, entry, task, run)
+
+    def _identity_problems(self, record: PartRecord, entry: PartEntry, task: Task, run: Run) -> Iterator[str]:
+        """How a part's record differs from what the dataset says of it."""
+        identity, manifest = record.identity, self._description.manifest
+        assert manifest is not None
+        for name, found, wanted in (
+            ("id", record.id, entry.id),
+            ("identity.task", identity.task, entry.task),
+            ("identity.step", identity.step, entry.step),
+            ("identity.data_version", identity.data_version, manifest.data_version),
+            ("identity.parameters", identity.parameters, task.parameters),
+            ("identity.seed", identity.seed, identity.seed if run.seed is None else run.seed),
+        ):
+            if found != wanted:
+                yield f"{name} is not the manifest's"
+        settings = self._settings.get(run.name)  # of the run's recipe; None where the run was not built
+        if settings is not None and not same_settings(identity.settings, settings):
+            yield "identity.settings is not the manifest's"
+        made = (identity.derived or {}).get("settings")
+        if run.kind in DERIVED_KINDS and (
+            not isinstance(made, dict) or made.get("task") != run.source_of(task.index)
+        ):
+            yield "identity.derived.settings.task is not the manifest's"
+        for name in STATISTICS:
+            if getattr(record.statistics, name) != getattr(entry, name):
+                yield f"statistics.{name} is not that of parts.jsonl"
+        for name in REFERENCES:
+            if getattr(record.references, name) != getattr(entry, name):
+                yield f"references.{name} is not that of parts.jsonl"
 
 
 ContentProblem = tuple[str, str]
@@ -269,43 +291,3 @@ def _flag_problems(arrays: Mapping[str, npt.NDArray[Any]]) -> Iterator[ContentPr
             yield "terminated", f"or truncated is set before the last step of episode {episode}"
         if stop > start and not ended[stop - 1]:
             yield "truncated", f"nor terminated is set at the end of episode {episode}"
-
-
-def _identity_problems(
-    record: PartRecord,
-    *,
-    entry: PartEntry,
-    task: Task,
-    run: Run,
-    settings: Mapping[str, Any] | None,
-    data_version: int,
-) -> Iterator[str]:
-    """How a part's record differs from what the dataset says of it.
-
-    Args:
-        settings: of the run's recipe; None where the run was not built.
-    """
-    identity = record.identity
-    for name, found, wanted in (
-        ("id", record.id, entry.id),
-        ("identity.task", identity.task, entry.task),
-        ("identity.step", identity.step, entry.step),
-        ("identity.data_version", identity.data_version, data_version),
-        ("identity.parameters", identity.parameters, task.parameters),
-        ("identity.seed", identity.seed, identity.seed if run.seed is None else run.seed),
-    ):
-        if found != wanted:
-            yield f"{name} is not the manifest's"
-    if settings is not None and not same_settings(identity.settings, settings):
-        yield "identity.settings is not the manifest's"
-    made = (identity.derived or {}).get("settings")
-    if run.kind in DERIVED_KINDS and (
-        not isinstance(made, dict) or made.get("task") != run.source_of(task.index)
-    ):
-        yield "identity.derived.settings.task is not the manifest's"
-    for name in STATISTICS:
-        if getattr(record.statistics, name) != getattr(entry, name):
-            yield f"statistics.{name} is not that of parts.jsonl"
-    for name in REFERENCES:
-        if getattr(record.references, name) != getattr(entry, name):
-            yield f"references.{name} is not that of parts.jsonl"

@@ -11,7 +11,8 @@ from tcmrl_data.building.work_files import WORK_FILES, WORK_FOLDERS
 from tcmrl_data.envs.base import Task
 from tcmrl_data.foundation.errors import ManifestError
 from tcmrl_data.foundation.files import one_line, status_of, words_after
-from tcmrl_data.store.manifest import MANIFEST, Manifest, is_complete, read_manifest
+from tcmrl_data.foundation.records import differences
+from tcmrl_data.store.manifest import MANIFEST, Manifest, is_complete, read_manifest, totals_of
 from tcmrl_data.store.part_table import PARTS_TABLE, PartTable, parse_parts
 from tcmrl_data.store.tables import (
     PARTS,
@@ -201,17 +202,11 @@ class Description:
         kept = table.without_tasks(manifest.dropped)
         expected = {
             "root": kept.root,
-            "totals.parts": len(kept),
-            "totals.episodes": kept.total("episodes"),
-            "totals.steps": kept.total("steps"),
-            "totals.bytes": kept.total("size"),
+            "totals": totals_of(kept).model_dump(),
             "complete": is_complete(kept, manifest.runs, num_tasks=manifest.num_tasks),
         }
-        found = manifest.model_dump(include={"root", "totals", "complete"})
-        found |= {f"totals.{name}": value for name, value in found["totals"].items()}
-        for name, value in expected.items():
-            if found[name] != value:
-                self._add(MANIFEST, f"{name} does not agree with {PARTS_TABLE}")
+        for name, _, _ in differences(expected, manifest.model_dump(include={*expected})):
+            self._add(MANIFEST, f"{name} does not agree with {PARTS_TABLE}")
 
     def _add(self, file: str, problem: str) -> None:
         self.findings.append(finding(file, problem))
