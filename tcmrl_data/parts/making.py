@@ -119,16 +119,7 @@ def wanted_from(
     Args:
         simulator: of that task, for an operation that simulates: the new part goes by its recipe.
     """
-    identity = source.record.identity
-    wanted = WantedPart(
-        settings=identity.settings,
-        task=task,
-        step=identity.step,
-        seed=identity.seed,
-        snapshot=source.snapshot,
-        derived=operation.derived(source.record),
-        data_version=identity.data_version,
-    )
+    wanted = dataclasses.replace(source.wanted(), task=task, derived=operation.derived(source.record))
     if not operation.simulates:
         return wanted
     assert simulator is not None

@@ -97,6 +97,19 @@ class StoredPart:
         task = Task(identity.task, "train", identity.parameters)  # no episode depends on the split
         return cls(record, place, functools.partial(read_arrays, archive), snapshot, task)
 
+    def wanted(self) -> WantedPart:
+        """Its identity but for its arrays, from which it can be made again."""
+        identity = self.record.identity
+        return WantedPart(
+            settings=identity.settings,
+            task=self.task,
+            step=identity.step,
+            seed=identity.seed,
+            snapshot=self.snapshot,
+            derived=identity.derived,
+            data_version=identity.data_version,
+        )
+
     def episodes(self, *, without: Collection[str] = ()) -> list[Trajectory]:
         """The episodes, without some of their extra arrays.
 

@@ -18,7 +18,6 @@ from tcmrl_data.parts.operation import (
     Simulator,
     Sources,
     StoredPart,
-    WantedPart,
     can_be_made_again,
 )
 from tcmrl_data.parts.own_operations import SUBSET, operation_of
@@ -90,16 +89,7 @@ def replay_part(
             sources = list(_open_sources(stack, record, files or {}).values())
             if not sources and {"observations", "actions"} <= {*operation.keeps}:
                 sources = [stored]
-            wanted = WantedPart(
-                identity.settings,
-                stored.task,
-                identity.step,
-                identity.seed,
-                stored.snapshot,
-                identity.derived,
-                identity.data_version,
-            )
-            made = pack(operation.make(wanted, Sources(simulator, sources)))
+            made = pack(operation.make(stored.wanted(), Sources(simulator, sources)))
         compare = _drift_problems if differences else _bit_problems
         problems = tuple(compare(read_arrays(archive, identity.arrays), made))
     except MissingSourceError:
