@@ -82,7 +82,7 @@ class PreparedParts:
         """A build whose units publish the prepared parts."""
 
         def keys_of(unit: Unit) -> list[PartKey]:
-            indices = {task["index"] for task in unit.spec["tasks"]}
+            indices = {task["index"] for task in unit.spec["plan"]["tasks"]}
             return [key for key in self.files if key.task in indices]
 
         engine = prepared_engine(out, self.files, keys_of)

@@ -291,12 +291,7 @@ class Choice:
 
 
 def plan_subset(source: Dataset, choice: Choice, *, label: str | None = None) -> Plan:
-    """The dataset of a choice.
-
-    Raises:
-        SelectionError: nothing is left of a task, a part has fewer episodes than are asked for, or an array
-            cannot be left out.
-    """
+    """The dataset of a choice; errors as of `derive_dataset`."""
     selection = source.select(split=choice.split, tasks=choice.tasks, snapshots=choice.snapshots)
     tasks = _with_held_out(source, sorted(selection.tasks, key=lambda task: task.index), choice.held_out)
     splits = {task.index: task.split for task in tasks} if choice.held_out else None

@@ -148,20 +148,15 @@ class _MergedRun:
 def plan_merge(
     sources: Sequence[Dataset],
     *,
-    names: Sequence[str | None] = (),
-    split_from: str | None = None,
-    label: str | None = None,
+    names: Sequence[str | None],
+    split_from: str | None,
+    label: str | None,
 ) -> Plan:
-    """The union of datasets.
+    """The union of datasets, as `merge_datasets` is told.
 
     Args:
-        sources: at least two, of the same environment.
-        names: of each source's run `main` in the union; further runs get the name and their own. None, or no
-            names at all, keep a run's name where it is free.
+        names: of each source's run `main`; further runs get the name and their own.
         split_from: digest of the source whose splits decide.
-
-    Raises:
-        SelectionError: the sources disagree; the message names what, where, and both values.
     """
     pairs = list(zip(sources, names or [None] * len(sources), strict=True))
     pairs.sort(key=lambda pair: (pair[0].manifest.root, pair[0].manifest.digest, pair[1] or ""))

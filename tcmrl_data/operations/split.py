@@ -65,7 +65,7 @@ def split_dataset(
     if folds is not None:
         plans = [plan_fold(opened, folds=folds, seed=seed, fold=fold) for fold in range(folds)]
     else:
-        plans = list(_plan_episodes(opened, tuple(episodes or ())))
+        plans = list(plan_episodes(opened, episodes or ()))
     chosen = [str(number) for number in range(len(plans))] if names is None else list(names)
     if len(set(chosen)) != len(plans) or any(
         name in ("", ".", "..") or Path(name).name != name for name in chosen
@@ -89,11 +89,7 @@ def split_dataset(
 
 
 def plan_fold(source: Dataset, *, folds: int, seed: int, fold: int) -> Plan:
-    """The dataset in which one fold of the tasks is the test split, and all others the training split.
-
-    Raises:
-        SelectionError: fewer than two folds, or so many that a split would lack tasks.
-    """
+    """The dataset in which one fold of the tasks is the test split, and all others the training split."""
     tasks = source.tasks
     if not 2 <= folds <= len(tasks) or len(tasks) - -(-len(tasks) // folds) < 2:
         raise SelectionError(
@@ -130,31 +126,29 @@ def _tested(source: Dataset, *, folds: int, seed: int, fold: int) -> set[int]:
     return {source.tasks[position].index for position in permutation[fold::folds]}
 
 
-def plan_episodes(source: Dataset, *, first: int, number: int) -> Plan:
-    """The dataset of some consecutive episodes of every part."""
-    parts = []
-    for entry in source.parts.entries():
-        if first + number > entry.episodes:
-            raise SelectionError(
-                f"{source.path}: {entry.key} has {entry.episodes} episodes, not {first + number}"
-            )
-        cut = None if number == entry.episodes else Cut.of(range(first, first + number))
-        parts.append(PlannedPart(entry.key, source, entry.key, cut))
-    keys, cut_runs = [part.key for part in parts], {part.key.run for part in parts if part.operation}
-    return Plan(
-        runs=settle_runs(source.manifest.runs, keys, source.tasks, cut=cut_runs),
-        tasks=source.tasks,
-        parts=tuple(parts),
-        derivation=derivation_of(EPISODES, {"first": first, "number": number}, [source]),
-        sources=(source,),
-    )
-
-
-def _plan_episodes(source: Dataset, numbers: tuple[int, ...]) -> Iterator[Plan]:
+def plan_episodes(source: Dataset, numbers: Sequence[int]) -> Iterator[Plan]:
+    """Datasets of consecutive episodes of every part, as many as each number says."""
     if len(numbers) < 2 or min(numbers) < 1:
-        raise SelectionError(f"--episodes {numbers}: expected two numbers or more, each at least 1, as 45,5")
+        raise SelectionError(
+            f"--episodes {tuple(numbers)}: expected two numbers or more, each at least 1, as 45,5"
+        )
     for place, number in enumerate(numbers):
-        yield plan_episodes(source, first=sum(numbers[:place]), number=number)
+        first, parts = sum(numbers[:place]), list[PlannedPart]()
+        for entry in source.parts.entries():
+            if first + number > entry.episodes:
+                raise SelectionError(
+                    f"{source.path}: {entry.key} has {entry.episodes} episodes, not {first + number}"
+                )
+            cut = None if number == entry.episodes else Cut.of(range(first, first + number))
+            parts.append(PlannedPart(entry.key, source, entry.key, cut))
+        keys, cut_runs = [part.key for part in parts], {part.key.run for part in parts if part.operation}
+        yield Plan(
+            runs=settle_runs(source.manifest.runs, keys, source.tasks, cut=cut_runs),
+            tasks=source.tasks,
+            parts=parts,
+            derivation=derivation_of(EPISODES, {"first": first, "number": number}, [source]),
+            sources=[source],
+        )
 
 
 def _is_made(plan: Plan, target: Path) -> bool:

@@ -27,9 +27,6 @@ from tcmrl_data.store.part_table import REFERENCES, STATISTICS, PartEntry
 from tcmrl_data.store.tables import MAX_TASKS, TASKS
 from tcmrl_data.verification.description import Description, VerifyLevel
 
-MISSING = "is missing"
-
-
 DERIVED_KINDS = ("extended", "relabelled")
 """Kinds of runs whose parts name the task that their policy or their episodes come from."""
 
@@ -55,7 +52,7 @@ class PartChecks:
         if status is None:
             blocked = folder_problem(self._folder, file.rpartition("/")[0])
             in_the_way = blocked is not None and os.path.lexists(self._folder / blocked[0])
-            yield f"cannot be reached: {blocked[0]} {blocked[1]}" if blocked and in_the_way else MISSING
+            yield f"cannot be reached: {blocked[0]} {blocked[1]}" if blocked and in_the_way else "is missing"
             return
         odd = file_problem(status)
         if odd is not None:
