@@ -238,11 +238,9 @@ def one_thread() -> Iterator[None]:
 
 def numbered(parts: Iterable[Published], platforms: list[Platform]) -> list[PartEntry]:
     """The parts' lines with the positions of their platforms; adds new platforms to the list."""
-    positions = {platform.digest(): position for position, platform in enumerate(platforms)}
     entries = []
     for part in parts:
-        position = positions.setdefault(part.platform.digest(), len(platforms))
-        if position == len(platforms):
+        if part.platform not in platforms:
             platforms.append(part.platform)
-        entries.append(part.entry._replace(platform=position))
+        entries.append(part.entry._replace(platform=platforms.index(part.platform)))
     return entries
