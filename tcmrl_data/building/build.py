@@ -179,12 +179,7 @@ WORKER = "tcmrl_data.building.plan"
 
 
 class Driver:
-    """Runs the units that have missing parts.
-
-    Args:
-        ledger: of the dataset; the driver is its only writer.
-        checkpoint_seconds: least time between two checkpoints of behavior training.
-    """
+    """Runs the units that have missing parts; the only writer of the ledger."""
 
     def __init__(
         self, ledger: Ledger, dataset: Path, *, checkpoint_seconds: float = CHECKPOINT_SECONDS

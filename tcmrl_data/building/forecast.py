@@ -135,13 +135,7 @@ def estimate_seconds(plan: BuildPlan, workers: int) -> tuple[float, float, float
 def task_seconds(
     source: BehaviorSource, found: Sequence[Measurement], *, update: float, stretch: float
 ) -> float:
-    """Seconds of one task: warm-up, updates and parts, multiplied by their numbers.
-
-    Args:
-        source: says how many of them there are.
-        update: seconds per environment step with its updates.
-        stretch: by how much rollouts take longer than the probes'.
-    """
+    """Seconds of one task: warm-up, updates and parts, multiplied by their numbers in the source."""
     warmup_steps = min(source.warmup_steps, source.training_steps)
     training = warmup_steps * _mean(found, "warmup") + (source.training_steps - warmup_steps) * update
     parts = _mean(found, "first_part") + (len(source.steps) - 1) * _mean(found, "part")

@@ -154,11 +154,7 @@ class Ledger:
         return True
 
     def take_in_unreported(self, task: int, *, deadline: float = 0.0) -> list[PartKey]:
-        """Adds the parts of a task whose reports were lost; returns those that are missing or damaged.
-
-        Args:
-            deadline: seconds to wait at most for a file that another machine may have published.
-        """
+        """Adds the parts of a task whose reports were lost; returns those that are missing or damaged."""
         missing = []
         for key in self.missing(task):
             visible = wait_until_visible(self._out / part_file(key), deadline=deadline)

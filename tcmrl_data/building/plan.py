@@ -173,12 +173,7 @@ def plan_build(
 
 @dataclass(frozen=True)
 class UnitSpec:
-    """What a worker is told, as JSON.
-
-    Attributes:
-        plan: of the unit's tasks, which are trained together.
-        checkpoint_seconds: least time between two checkpoints of behavior training.
-    """
+    """What a worker is told, as JSON: the plan of the unit's tasks, which are trained together."""
 
     dataset: Path
     plan: BuildPlan
@@ -207,11 +202,7 @@ def run_unit(spec: UnitSpec, report: Send) -> str:
 
 @final
 class PartMaker:
-    """Rolls out and publishes the snapshots of one task, with one simulator.
-
-    Args:
-        behavior: what the behavior source records with its parts.
-    """
+    """Rolls out and publishes the snapshots of one task, with one simulator."""
 
     def __init__(self, dataset: Path, plan: BuildPlan, *, task: Task, behavior: Mapping[str, Any]) -> None:
         self._dataset, self._behavior = dataset, behavior

@@ -62,12 +62,7 @@ def read_plain_file(file: Path, *, limit: int) -> bytes:
 
 
 def open_plain_file(file: Path, *, limit: int) -> BinaryIO:
-    """Opens a regular file for reading, under the conditions of `read_plain_file`.
-
-    Raises:
-        ValueError: not a regular file, or larger than the limit; the message does not name the file.
-        OSError: the file is missing or cannot be opened.
-    """
+    """Opens a regular file for reading; errors as of `read_plain_file`."""
     descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     status = os.fstat(descriptor)
     problem = file_problem(status)

@@ -169,11 +169,7 @@ def record_bytes(record: BaseModel) -> bytes:
 
 
 def read_record(kind: type[Kind], file: Path, *, remedy: str = "") -> Kind:
-    """Reads a record written by `write_record`.
-
-    Raises:
-        CheckpointError: the file is missing, or its content is not a valid `kind`.
-    """
+    """Reads a record written by `write_record`; raises `CheckpointError` where that cannot be done."""
     try:
         return kind.model_validate_json(file.read_bytes())
     except OSError as problem:

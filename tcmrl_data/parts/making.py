@@ -139,8 +139,7 @@ def make_from(
     """The record and the archive of the part that an operation makes of a stored one.
 
     Args:
-        simulator: of that task, for an operation that simulates.
-        references: of that task; parts that are not simulated keep those of the stored one.
+        references: of the task; parts that are not simulated keep those of the stored one.
     """
     wanted = wanted_from(operation, source, task=task, simulator=simulator)
     episodes = operation.make(wanted, Sources(simulator, (source,)))

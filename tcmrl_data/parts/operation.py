@@ -193,11 +193,7 @@ class Sources:
 
     @property
     def part(self) -> StoredPart:
-        """The one part that another is made from.
-
-        Raises:
-            MissingSourceError: it is not among the sources.
-        """
+        """The one part that another is made from; raises `MissingSourceError` where it is not at hand."""
         if not self.parts:
             raise MissingSourceError("the part that it was made from is not in this dataset")
         return self.parts[0]

@@ -31,11 +31,7 @@ _PART_FILE = re.compile(rf"{PARTS}/({RUN_NAME})/([0-9]{{5,10}})/([0-9]{{7,10}})\
 
 
 class PartKey(NamedTuple):
-    """What a part is called within a dataset; keys are sorted by task, step and run.
-
-    Attributes:
-        run: name of the run that the part belongs to.
-    """
+    """What a part is called within a dataset; keys are sorted by task, step and run."""
 
     task: int
     step: int
@@ -123,11 +119,7 @@ class TableSeal(Record):
 
 
 def read_sealed(file: Path, seal: TableSeal) -> bytes:
-    """The sealed lines of a table.
-
-    Raises:
-        ManifestError: the file is missing or damaged, or is no plain file; the message names it.
-    """
+    """The sealed lines of a table; raises `ManifestError` for a file that is missing or damaged."""
     data = read_lines(file, seal.bytes)
     found = hashlib.sha256(data).hexdigest()
     if len(data) != seal.bytes or found != seal.sha256 or data.count(b"\n") != seal.lines:
@@ -150,11 +142,7 @@ def read_log(file: Path, seal: TableSeal) -> bytes:
 
 
 def blocks(data: bytes, file: Path) -> Iterator[bytes]:
-    """Splits lines into JSON arrays of many lines each.
-
-    Raises:
-        ManifestError: a line is too long; the message names the file.
-    """
+    """Splits lines into JSON arrays of many lines each; raises `ManifestError` where one is too long."""
     start = 0
     while start < len(data):
         end = data.rfind(b"\n", start, start + BLOCK_BYTES)
