@@ -324,7 +324,8 @@ def test_the_engine_inside_the_process_returns_errors_and_raises_crashes(
     assert (done.digest, failed.ok) == (reference(tiny, 40), False)
     assert str(blocked) in str(failed.error)
     assert messages.count(("task 40", "part")) == 3
-    crashing = replace(units[0], spec={**units[0].spec, "tasks": ["no task"]})
+    spec = units[0].spec
+    crashing = replace(units[0], spec={**spec, "plan": {**spec["plan"], "tasks": ["no task"]}})
     with pytest.raises(ValueError, match="Input should be an object"):
         list(InProcessEngine().run([crashing], lambda unit, message: None))
 
