@@ -203,7 +203,7 @@ def test_the_list_of_experiments_says_what_each_asks(call: Call) -> None:
 def test_data_may_name_the_one_dataset_itself(tiny_folder: Path, tmp_path: Path) -> None:
     tour = load_experiment("tour")
     with pytest.raises(SelectionError, match=r"--profile quick --out data/demo.*--data"):
-        plan_runs(tour, data=tmp_path, out=tmp_path)
+        plan_runs(tour, data=None, out=tmp_path)
     runs = plan_runs(tour, data=tiny_folder, out=tmp_path)
     assert {run.dataset for run in runs} == {str(tiny_folder.resolve())}
     assert len(runs) == 10

@@ -74,13 +74,13 @@ def test_what_a_file_sets_goes_over_tuned_settings(tiny_folder: Path, tmp_path: 
     }
     experiment = _experiment(tiny_folder, methods=methods)
     found = tuned_settings(experiment, tmp_path)
-    plans = plan_runs(experiment, data=tmp_path, out=tmp_path, tuned=found)
+    plans = plan_runs(experiment, data=None, out=tmp_path, tuned=found)
     assert [_searched(plan) for plan in plans] == [(0.002, 0.7), (0.002, 0.5)]
     assert plans[0].tuned == plans[1].tuned == found["point-robot"]["tcmrl"]
     assert (found["point-robot"]["tcmrl"].trials, found["point-robot"]["tcmrl"].score) == (2, 0.5)
     place = {"dataset": str(tiny_folder), "training": {"optimizer": {"learning_rate": 0.1}}}
     experiment = _experiment(tiny_folder, methods=methods, environments={"point-robot": place})
-    plans = plan_runs(experiment, data=tmp_path, out=tmp_path, tuned=found)
+    plans = plan_runs(experiment, data=None, out=tmp_path, tuned=found)
     assert [_searched(plan) for plan in plans] == [(0.1, 0.7), (0.1, 0.5)]
 
 

@@ -59,7 +59,6 @@ class BuildPlan:
 
     @functools.cached_property
     def environment(self) -> Environment:
-        """The recipe's environment."""
         return self.recipe.make_environment()
 
     @functools.cached_property
