@@ -5,6 +5,7 @@ import os
 import re
 import shlex
 import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +73,8 @@ def test_a_page_runs_as_printed(
         for command in commands(block):
             if command.words[0] in PROGRAMS:
                 run(command, block, capsys)
+            elif command.words[0] == "mkdir":
+                subprocess.run(command.words, check=True)
     plt.close("all")
 
 
