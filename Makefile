@@ -16,7 +16,8 @@ RUN ?= runs/demo
 VENV := .venv
 BIN := $(VENV)/bin
 EXTRAS := docs,minari,parquet,ray,remote,report,tensordict,test,tune
-TORCH := torch==2.13.0 $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
+# Without its dependencies, which the next command takes from PyPI.
+TORCH := --no-deps torch==2.13.0 $(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 INSTALLED := $(VENV)/.installed
 INSTALLED_TEST := $(VENV)/.installed-test
 INSTALLED_DOCS := $(VENV)/.installed-docs
