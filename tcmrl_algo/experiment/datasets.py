@@ -34,12 +34,7 @@ class MissingDataset:
 
 
 def missing_datasets(experiment: Experiment, data: Path | None = None) -> list[MissingDataset]:
-    """The datasets of an experiment that do not exist.
-
-    Args:
-        data: folder of datasets, one per environment; or one dataset. If left out, the datasets that the
-            experiment's file names, else those in `data`.
-    """
+    """The datasets of an experiment that do not exist; `data` as for `run_experiment`."""
     return [
         MissingDataset(environment, folder, _profile_to_build(choice))
         for environment, choice in experiment.environments.items()
