@@ -17,7 +17,7 @@ from tcmrl_algo.algorithms.core.context import ContextAlgorithm, ContextLosses
 from tcmrl_algo.algorithms.core.networks import call_frozen
 from tcmrl_algo.algorithms.tcmrl import negative_reward_loss, reverse_context, task_contrastive_loss
 from tcmrl_algo.experiment.spec import load_experiment
-from tcmrl_data import Batch, Steps
+from tcmrl_data import Batch, Steps, TrainingError
 from tests.made_up import EPISODE, TASKS, batch, problem, settings, steps, with_steps
 
 SMALL: dict[str, Any] = {"latent": 4, "encoder_hidden": (8,), "tce_hidden": (8,), "estimator_hidden": (8,)}
@@ -294,6 +294,17 @@ def test_k_is_the_length_of_the_windows(window_length: int) -> None:
     first = losses_of(learner()).metrics
     different = {name for name, value in first.items() if not torch.equal(value, found[name])}
     assert different == ({"loss/contrastive"} if window_length != 2 else set())
+
+
+def test_windows_longer_than_every_episode_are_refused() -> None:
+    made = settings()
+    sizes = made.batch.model_copy(update={"window_length": EPISODE + 1})
+    longer = made.model_copy(update={"batch": sizes})
+    with pytest.raises(TrainingError, match=rf"window_length {EPISODE + 1} .* an episode, {EPISODE} steps"):
+        tcmrl.TcmrlLearner(problem(), longer, tcmrl.TcmrlConfig.model_validate(SMALL))
+    tcmrl.TcmrlLearner(
+        problem(), longer, tcmrl.TcmrlConfig.model_validate(SMALL | {"weights": {"contrastive": 0}})
+    )
 
 
 @pytest.mark.parametrize(

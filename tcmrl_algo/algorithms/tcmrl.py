@@ -56,7 +56,7 @@ from tcmrl_algo.algorithms.core.networks import (
 )
 from tcmrl_algo.algorithms.core.problem import Problem
 from tcmrl_algo.algorithms.core.settings import TrainingSettings
-from tcmrl_data import Batch, BatchRequest, Steps, Trajectories, Windows
+from tcmrl_data import Batch, BatchRequest, Steps, TrainingError, Trajectories, Windows
 from tcmrl_data.foundation.records import Frozen
 
 TRIED_WEIGHTS = Options((0.0, 0.01, 0.1, 1.0))
@@ -327,6 +327,12 @@ class TcmrlLearner(ContextLearner):
         super().__init__()
         self.latent, self.config = config.latent, config
         self._horizon, self._window_length = problem.horizon, settings.batch.window_length
+        if config.weights.contrastive and self._window_length > self._horizon:
+            raise TrainingError(
+                f"batch.window_length {self._window_length} is longer than an episode, "
+                f"{self._horizon} steps, so that the contrastive loss has no window; choose a shorter one, "
+                "or tcmrl.weights.contrastive = 0"
+            )
         self.estimates_trajectories = config.reward_estimation == "trajectory" or (
             config.reward_estimation == "auto" and problem.reward_density == "sparse"
         )
