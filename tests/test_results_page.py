@@ -153,6 +153,26 @@ def test_a_difference_is_by_hand_and_never_crosses_datasets() -> None:
         elsewhere.board("small", "point-robot")
 
 
+def test_curves_are_compared_by_the_means_of_their_points_run_by_run() -> None:
+    """Means 2 and 5 of A, 1 and 3 of B: differences 1 and 2."""
+
+    def curve(method: str, seed: int, *finals: float) -> list[CurveRow]:
+        place = ("small", "point-robot", "1" * 16, method, seed, None, "offline")
+        return [CurveRow(*place, 10 * (step + 1), final, 0.0) for step, final in enumerate(finals)]
+
+    curves = [
+        *curve("A", 0, 1.0, 3.0),
+        *curve("A", 1, 5.0, 5.0),
+        *curve("B", 0, 1.0),
+        *curve("B", 1, 2.0, 4.0),
+    ]
+    numbers = Numbers([], curves)
+    found = numbers.curve_difference("small", "point-robot", "A", "B")
+    assert (found.mean, found.pairs) == (1.5, 2)
+    with pytest.raises(TrainingError, match="share no data"):
+        numbers.curve_difference("small", "point-robot", "A", "C")
+
+
 def test_runs_on_several_datasets_compare_within_each() -> None:
     roots = ("1" * 64, "2" * 64)
     numbers = _numbers(*(_rows("A", 5.0 + place, root=root) for place, root in enumerate(roots)))

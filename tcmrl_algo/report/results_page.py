@@ -4,7 +4,7 @@ The template is `README.md.jinja` beside the table, or else the one of this pack
 experiment and environment. `Numbers` are the names that a template may use.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -27,6 +27,8 @@ DEFAULT = "results.md.jinja"
 BLIND = "no_context"
 """The method that adapts to nothing."""
 DIGITS = 3
+Pair = tuple[str, int | None, int]
+"""Data, fold and seed."""
 
 
 @dataclass(frozen=True)
@@ -137,13 +139,22 @@ class Numbers:
             row.pair: getattr(row, other_column or column)
             for row in self.runs(other_experiment or experiment, environment, other, protocol)
         }
-        gains = [left[pair] - right[pair] for pair in left if pair in right]
-        if not gains:
-            raise TrainingError(
-                f"{experiment}, {environment}, {protocol}: {method} and {other} share no data, fold and seed"
-            )
-        low, high = mean_interval(gains, fewest=2) or (None, None)
-        return Difference(fmean(gains), low, high, len(gains), sign_probability(gains))
+        return _paired(left, right, f"{experiment}, {environment}, {protocol}: {method} and {other}")
+
+    def curve_difference(self, experiment: str, environment: str, method: str, other: str) -> Difference:
+        """As `difference`, of the means over the points of learning curves: how soon methods learn.
+
+        Raises:
+            TrainingError: no two curves share data, fold and seed.
+        """
+        finals: dict[str, dict[Pair, list[float]]] = {method: {}, other: {}}
+        for row in self.curves:
+            if (row.experiment, row.environment) == (experiment, environment) and row.method in finals:
+                finals[row.method].setdefault(row.pair, []).append(row.final)
+        left, right = (
+            {pair: fmean(found) for pair, found in finals[name].items()} for name in (method, other)
+        )
+        return _paired(left, right, f"{experiment}, {environment}, curves: {method} and {other}")
 
     def score(self, tuning: str, trial: int | None = None) -> float:
         """Score of a trial on held-out training tasks; of the best one where none is named.
@@ -375,6 +386,15 @@ def _p_text(probability: float) -> str:
 
 def _shown(value: Any) -> Any:
     return number(value) if isinstance(value, float) else value
+
+
+def _paired(left: Mapping[Pair, float], right: Mapping[Pair, float], place: str) -> Difference:
+    """The differences of values with the same data, fold and seed."""
+    gains = [left[pair] - right[pair] for pair in left if pair in right]
+    if not gains:
+        raise TrainingError(f"{place} share no data, fold and seed")
+    low, high = mean_interval(gains, fewest=2) or (None, None)
+    return Difference(fmean(gains), low, high, len(gains), sign_probability(gains))
 
 
 def _names(numbers: Numbers) -> dict[str, Any]:

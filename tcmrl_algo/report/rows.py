@@ -139,6 +139,11 @@ class CurveRow:
     final: float
     shuffled: float
 
+    @property
+    def pair(self) -> tuple[str, int | None, int]:
+        """As `RunRow.pair`."""
+        return self.root, self.fold, self.seed
+
 
 @dataclass(frozen=True)
 class WorthRow:
