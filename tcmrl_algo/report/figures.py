@@ -46,9 +46,9 @@ def draw_method_curves(
 def _draw_curve(
     axes: "Axes", index: int, label: str, steps: Sequence[int], runs: Sequence[Sequence[float]]
 ) -> None:
-    color = f"C{index % 10}"
+    color, style = f"C{index % 10}", "o-" if index < 10 else "s--"  # there are ten colors
     points = [summarize(values) for values in zip(*runs, strict=True)]
-    axes.plot(steps, [point.mean for point in points], "o-", color=color, label=label, markersize=3)
+    axes.plot(steps, [point.mean for point in points], style, color=color, label=label, markersize=3)
     lows, highs = [point.low for point in points], [point.high for point in points]
     if None not in lows:
         axes.fill_between(steps, lows, highs, color=color, alpha=0.2, linewidth=0)  # type: ignore[arg-type]
