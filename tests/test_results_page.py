@@ -164,7 +164,7 @@ def test_curves_are_compared_by_the_means_of_their_points_run_by_run() -> None:
         *curve("A", 0, 1.0, 3.0),
         *curve("A", 1, 5.0, 5.0),
         *curve("B", 0, 1.0),
-        *curve("B", 1, 2.0, 4.0),
+        *curve("B", 1, 0.0, 6.0),
     ]
     numbers = Numbers([], curves)
     found = numbers.curve_difference("small", "point-robot", "A", "B")

@@ -16,7 +16,7 @@ import jinja2
 from tcmrl_algo.experiment.results import Row, read_table
 from tcmrl_algo.experiment.tunings import TABLE, TrialRow
 from tcmrl_algo.report.figures import draw_board, draw_method_curves
-from tcmrl_algo.report.rows import CURVES, WORTH, CurveRow, RunRow, WorthRow
+from tcmrl_algo.report.rows import CURVES, WORTH, CurveRow, Pair, RunRow, WorthRow
 from tcmrl_algo.report.statistics import holm, mean_interval, sign_probability
 from tcmrl_data import TrainingError
 from tcmrl_data.foundation.disk import make_folders, replace_file
@@ -27,8 +27,6 @@ DEFAULT = "results.md.jinja"
 BLIND = "no_context"
 """The method that adapts to nothing."""
 DIGITS = 3
-Pair = tuple[str, int | None, int]
-"""Data, fold and seed."""
 
 
 @dataclass(frozen=True)

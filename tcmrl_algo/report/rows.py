@@ -24,6 +24,8 @@ from tcmrl_algo.training.config import stage_plan
 from tcmrl_data import Worth
 from tcmrl_data.foundation.records import digest, read_record
 
+Pair = tuple[str, int | None, int]
+"""Root of the data, fold and seed, by which runs of two methods are compared."""
 RUNS, CURVES, WORTH = "runs.csv", "curves.csv", "worth.csv"
 HEX_DIGITS = 16
 """Of roots and digests."""
@@ -119,7 +121,7 @@ class RunRow:
     processor: str
 
     @property
-    def pair(self) -> tuple[str, int | None, int]:
+    def pair(self) -> Pair:
         """Data, fold and seed, by which runs of two methods are compared."""
         return self.root, self.fold, self.seed
 
@@ -140,7 +142,7 @@ class CurveRow:
     shuffled: float
 
     @property
-    def pair(self) -> tuple[str, int | None, int]:
+    def pair(self) -> Pair:
         """As `RunRow.pair`."""
         return self.root, self.fold, self.seed
 
