@@ -153,6 +153,14 @@ def test_a_difference_is_by_hand_and_never_crosses_datasets() -> None:
         elsewhere.board("small", "point-robot")
 
 
+def test_a_share_divides_run_by_run_before_it_averages() -> None:
+    """1 of 2 and 3 of 4 are 0.625, where the means 2 and 3 would say 0.667; s = sqrt(1/32), t(1) = 12.706."""
+    rows = [replace(row, behavior=own) for row, own in zip(_rows("A", 1.0, 3.0), (2.0, 4.0), strict=True)]
+    half = 12.7062 * (1 / 32 / 2) ** 0.5
+    expected = f"0.625 ({number(0.625 - half)} to {number(0.625 + half)})"
+    assert Numbers(rows).share("small", "point-robot", "A", "offline") == expected
+
+
 def test_curves_are_compared_by_the_means_of_their_points_run_by_run() -> None:
     """Means 2 and 5 of A, 1 and 3 of B: differences 1 and 2."""
 

@@ -139,6 +139,15 @@ class Numbers:
         }
         return _paired(left, right, f"{experiment}, {environment}, {protocol}: {method} and {other}")
 
+    def share(
+        self, experiment: str, environment: str, method: str, protocol: str, of: str = "behavior"
+    ) -> str:
+        """A method's return divided by another column, run by run: the mean and its 95% interval, as text."""
+        place = (experiment, environment, method, protocol)
+        shares = [a / b for a, b in zip(self.values(*place), self.values(*place, of), strict=True)]
+        low, high = mean_interval(shares, fewest=2) or (None, None)
+        return number(fmean(shares)) + ("" if low is None else f" ({number(low)} to {number(high)})")
+
     def curve_difference(self, experiment: str, environment: str, method: str, other: str) -> Difference:
         """As `difference`, of the means over the points of learning curves: how soon methods learn.
 
