@@ -26,8 +26,9 @@ BEHAVIOR = "behavior: the best behavior policy of the task itself, without its n
 
 
 def score_tables(results: Sequence["Evaluation"]) -> list["Table"]:
-    """Tables of returns: controls, means by protocol if there are several, and test tasks by protocol."""
+    """Tables of returns: controls, means by protocol if there are several, and tasks by protocol."""
     first = results[0]
+    tasks = split_words(first.tasks[0].split)
     mark = " (privileged)" if first.privileged else ""
     run = f"{first.algorithm}{mark} on {first.environment}, seed {first.seed}"
     score, with_success = _score(results), _with_success(results)
@@ -38,10 +39,10 @@ def score_tables(results: Sequence["Evaluation"]) -> list["Table"]:
         return make_table(title, columns=columns, long_text=(row_name,))
 
     blocks = []
-    means = table(f"{run}: means over {len(first.tasks)} test tasks", "protocol")
+    means = table(f"{run}: means over {len(first.tasks)} {tasks}s", "protocol")
     for result in results:
         name = f"protocol {result.protocol}" if len(results) > 1 else f"{run}, {result.protocol}"
-        block = table(f"{name}: returns by test task", "task")
+        block = table(f"{name}: returns by {tasks}", "task")
         rows = [_values(task, score, with_success=with_success) for task in result.tasks]
         mean = [number(_mean(column)) for column in zip(*rows, strict=True)]
         for task, values in zip(result.tasks, rows, strict=True):
@@ -55,8 +56,9 @@ def score_tables(results: Sequence["Evaluation"]) -> list["Table"]:
 
 def _controls_table(result: "Evaluation") -> "Table":
     """Mean returns of the controls of the dataset, which are those of every protocol."""
+    tasks = f"{len(result.tasks)} {split_words(result.tasks[0].split)}s"
     table = make_table(
-        f"{result.environment}: controls, means over {len(result.tasks)} test tasks",
+        f"{result.environment}: controls, means over {tasks}",
         columns=("uniform", "fixed", "behavior", "oracle"),
     )
     names = ("random", "fixed", "behavior", "oracle")
@@ -68,6 +70,11 @@ def _values(task: "TaskResult", score: str, *, with_success: bool) -> list[float
     values = [task.random, task.oracle, task.final, task.shuffled]
     values.append(task.regret if score == "regret" else task.normalized)
     return [*values, task.success] if with_success else values
+
+
+def split_words(split: str) -> str:
+    """What a task of a split is called."""
+    return "training task" if split == "train" else "test task"
 
 
 def _score(results: Sequence["Evaluation"]) -> str:
@@ -91,7 +98,7 @@ def _mean(values: Sequence[float | None]) -> float | None:
     "--protocol",
     type=PROTOCOL_OR_ALL,
     show_default="the run's",
-    help="Adaptation protocol; `all` evaluates every protocol and compares them.",
+    help="Adaptation protocol; `all` compares those on test tasks.",
 )
 @click.option(
     "--dataset", type=PATH, metavar="FOLDER", help="Folder of the run's dataset, if the dataset was moved."
@@ -131,7 +138,8 @@ def evaluate(
     """Adapt the policy of RUN to the test tasks, and evaluate it.
 
     The protocol chooses the trajectories that the policy adapts to: trajectories that it collects on the
-    test task, stored trajectories of the test task, or stored trajectories of training tasks.
+    test task, stored trajectories of the test task, or stored trajectories of training tasks. `offline_train`
+    evaluates in training tasks, which shows whether a policy fails on new tasks alone; `all` leaves it out.
 
     The returns are compared with the controls of the dataset (`tcmrl controls`), which are measured once, and
     with the same policy under the contexts of other tasks. Returns are undiscounted. With --protocol all,
@@ -143,6 +151,7 @@ def evaluate(
     Examples:
       tcmrl evaluate runs/point-robot-tcmrl-seed0
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol all --json
+      tcmrl evaluate runs/point-robot-tcmrl-seed0 --protocol offline_train
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --plot paths.png
       tcmrl evaluate runs/point-robot-tcmrl-seed0 --repeats 10
     """
@@ -193,12 +202,12 @@ def evaluate(
 
 
 def _protocols(progress: StageProgress) -> list[str]:
-    """Names of the protocols that can be loaded; reports the others."""
+    """Names of the protocols on test tasks that can be loaded; reports those that cannot."""
     from tcmrl_algo import PROTOCOLS
 
     for error in PROTOCOLS.broken().values():
         progress.note(f"left out: {error}")
-    return list(PROTOCOLS.working())
+    return [name for name, protocol in PROTOCOLS.working().items() if protocol.split == "test"]
 
 
 COLUMNS = ("uniform", "fixed_snapshot", "fixed_target", "behavior", "oracle")

@@ -10,6 +10,7 @@ import click
 
 from tcmrl_data.recipe import PROFILES, Profile
 
+from .evaluation import split_words
 from .frame import (
     duration,
     fail_incomplete,
@@ -249,7 +250,8 @@ def result_tables(environment: str, results: Sequence["RunResult"]) -> list["Tab
     columns = ("method", "runs", "mean", "95%", "other", "regret", *success)
     tables = []
     for protocol in here[0].evaluations:
-        title = f"{environment}, protocol {protocol}: returns on the test tasks"
+        tasks = split_words(here[0].evaluations[protocol]["tasks"][0]["split"])
+        title = f"{environment}, protocol {protocol}: returns on the {tasks}s"
         table = make_table(title, columns=columns, long_text=("method",))
         for method, runs in by_method(here).items():
             rows = [row for result in runs for row in result.rows()]

@@ -47,13 +47,33 @@ def test_evaluation_repeats_exactly_and_adds_up(trained: Path, tiny: Dataset, pr
     (task,) = first.tasks
     references = tiny.references(task.task)
     assert (task.oracle, task.random) == (references.oracle, references.uniform)
-    assert task.regret == pytest.approx(oracle(tiny, tiny.test_tasks[0]) - task.final)
-    expected = (task.final - task.random) / (oracle(tiny, tiny.test_tasks[0]) - task.random)
+    best = oracle(tiny, tiny.task(task.task))
+    assert task.regret == pytest.approx(best - task.final)
+    expected = (task.final - task.random) / (best - task.random)
     assert task.normalized == pytest.approx(expected)
     assert task.reference == "oracle"
     assert len(task.returns) == 3
     assert first.mean_final == task.final
     assert first.mean_shuffled == task.shuffled
+
+
+def test_in_training_tasks_a_policy_returns_what_it_would_if_they_were_test_tasks(
+    trained: Path, tiny: Dataset, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (task,) = evaluate_run(trained, protocol="offline_train").tasks
+    assert (task.task, task.split) == (tiny.train_tasks[0].index, "train")
+    assert (task.behavior, task.fixed, task.reference) == (None, None, "oracle")
+    monkeypatch.setattr(Dataset, "test_tasks", tiny.train_tasks[:1])
+    (expected,) = evaluate_run(trained, protocol="offline").tasks
+    assert (task.final, task.returns) == (expected.final, expected.returns)
+
+
+def test_an_evaluation_in_training_tasks_says_so(trained: Path, call: Call) -> None:
+    code, output, _ = call("evaluate", trained, "--protocol", "offline_train", "--quiet")
+    assert code == 0
+    assert "means over 1 training tasks" in output
+    assert "offline_train: returns by training task" in output
+    assert "test task" not in output
 
 
 def test_a_random_first_stage_is_repeated_and_averaged(trained: Path) -> None:
@@ -234,7 +254,8 @@ def test_evaluations_by_every_protocol_fit_a_terminal_with_every_number_whole(tr
     shown = as_in_terminal(tcmrl, "evaluate", trained, "--protocol", "all", "--quiet")
     assert shown.code == 0
     assert_fits(shown.output)
-    for protocol in PROTOCOLS.names():
+    assert "offline_train" not in shown.output  # its tasks are others
+    for protocol in sorted(set(PROTOCOLS.names()) - {"offline_train"}):
         evaluation = evaluate_run(trained, protocol=protocol)
         (task,) = evaluation.tasks
         numbers = [task.random, task.oracle, task.final, task.shuffled, task.regret]

@@ -106,10 +106,9 @@ class Controls(Frozen):
     fixed_target: FixedTarget | None = None
     tasks: tuple[TaskControls, ...] = ()
 
-    def task(self, index: int) -> TaskControls:
-        """The controls of one test task."""
-        (found,) = (task for task in self.tasks if task.task == index)
-        return found
+    def task(self, index: int) -> TaskControls | None:
+        """The controls of a test task; None of a training task, where none are measured."""
+        return next((task for task in self.tasks if task.task == index), None)
 
     def mean(self, name: str) -> float | None:
         """Mean over the test tasks of the returns called `name`; None if a task has none."""

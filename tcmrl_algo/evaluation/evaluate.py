@@ -66,7 +66,7 @@ class TaskResult:
 
 @dataclass(frozen=True)
 class Evaluation:
-    """Result of a run on all test tasks; means are over tasks, and None if a task has no value.
+    """Result of a run on all tasks of its protocol; means are over tasks, and None if a task has no value.
 
     Attributes:
         repeats: how many times the protocol was run; 1 unless its first stage is random.
@@ -199,6 +199,8 @@ def evaluate_run(
         check_plot(plot, dataset.environment)
     adapts = PROTOCOLS.get(settings.protocol)()
     tasks = dataset.test_tasks
+    if adapts.split == "train":
+        tasks = tuple(evenly_spread(dataset.train_tasks, len(tasks)))
     if not tasks:
         raise TrainingError(
             f"{dataset.path} contains no test task; build one with `tcmrl-data build --tasks`"
@@ -251,13 +253,14 @@ def _result(
     dataset: Dataset,
     task: Task,
     adaptations: Sequence[Adaptation],
-    control: TaskControls,
+    control: TaskControls | None,
     final: Sequence[Trajectory],
     shuffled: Sequence[Trajectory],
 ) -> TaskResult:
     """Result of a task, given its adaptations, one per repeat, and its final episodes."""
     references, mean = dataset.references(task.index), _mean_return(final)
-    reference, best = _reference(references.oracle, control.behavior, references.behavior)
+    behavior, fixed = (None, None) if control is None else (control.behavior, control.fixed)
+    reference, best = _reference(references.oracle, behavior, references.behavior)
     return TaskResult(
         task=task.index,
         split=task.split,
@@ -266,8 +269,8 @@ def _result(
         finals=_finals(final, [len(one.contexts) for one in adaptations]),
         oracle=references.oracle,
         random=references.uniform,
-        behavior=control.behavior,
-        fixed=control.fixed,
+        behavior=behavior,
+        fixed=fixed,
         regret=None if references.oracle is None else references.oracle - mean,
         normalized=_share(mean, references.uniform, best),
         reference=reference,
@@ -279,10 +282,10 @@ def _result(
 def contexts_of_others(arena: Arena, task: Task, own: dict[int, list[Context]]) -> list[Context]:
     """Contexts of other tasks for the shuffled control, as many as the task has itself or more.
 
-    The contexts are those of up to MOST_OTHERS other test tasks, evenly spaced, in turn, and at least one
-    context per other task. A test task is skipped if it shares a context with this task (with `idaq`, two
-    test tasks may keep the context of the same training task) or has an empty context (the prior belongs to
-    no task). If no test task remains, the contexts are stored trajectories of training tasks.
+    The contexts are those of up to MOST_OTHERS other evaluated tasks, evenly spaced, in turn, and at least
+    one context per other task. A task is skipped if it shares a context with this task (with `idaq`, two
+    tasks may keep the context of the same training task) or has an empty context (the prior belongs to no
+    task). If none remains, the contexts are stored trajectories of training tasks.
     """
     num_own = len(own[task.index])
     excluded = {_key(context) for context in own[task.index]} | {()}

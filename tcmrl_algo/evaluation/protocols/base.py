@@ -3,7 +3,7 @@
 import abc
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 from tcmrl_algo.algorithms.core.settings import PROTOCOL_GROUP
 from tcmrl_algo.evaluation.arena import Arena, Context
@@ -34,6 +34,7 @@ class Protocol(abc.ABC):
 
     Attributes:
         name: the value of `--protocol`, of `run.protocol` and in `protocols` of an experiment.
+        split: the tasks that are evaluated: the test tasks, or as many training tasks, evenly spread.
         repeated: whether the first stage is random, so that evaluation adapts `run.repeats` times to every
             task and averages.
 
@@ -43,6 +44,7 @@ class Protocol(abc.ABC):
     """
 
     name: ClassVar[str]
+    split: ClassVar[Literal["train", "test"]] = "test"
     repeated: ClassVar[bool] = False
 
     @abc.abstractmethod
@@ -51,7 +53,7 @@ class Protocol(abc.ABC):
 
         Args:
             arena: runs episodes and draws stored trajectories.
-            tasks: the test tasks; of a repeated protocol every task `run.repeats` times, as lanes whose
+            tasks: those to adapt to; of a repeated protocol every task `run.repeats` times, as lanes whose
                 random draws are independent.
         """
 

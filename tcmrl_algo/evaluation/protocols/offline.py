@@ -1,16 +1,15 @@
-"""The usual protocol of offline meta-RL papers: contexts are stored trajectories of the test tasks."""
+"""The usual protocol of offline meta-RL papers: contexts are stored trajectories of the tasks themselves."""
 
 from collections.abc import Sequence
-from typing import final
+from typing import ClassVar, Literal, final
 
 from tcmrl_algo.evaluation.arena import Arena
 from tcmrl_algo.evaluation.protocols.base import Adaptation, Protocol
 from tcmrl_data import Task
 
 
-@final
 class OfflineProtocol(Protocol):
-    """Draws a context from the stored trajectories of the test task for every episode."""
+    """Draws a context from the stored trajectories of the task for every episode."""
 
     name = "offline"
 
@@ -25,3 +24,11 @@ class OfflineProtocol(Protocol):
             Adaptation([episode[lane].undiscounted_return for episode in episodes], contexts[lane])
             for lane in range(len(tasks))
         ]
+
+
+@final
+class OfflineTrainProtocol(OfflineProtocol):
+    """The same in training tasks: a policy that is no better there than in test tasks is not overfitted."""
+
+    name = "offline_train"
+    split: ClassVar[Literal["train", "test"]] = "train"
