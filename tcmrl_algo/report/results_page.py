@@ -247,7 +247,7 @@ class Numbers:
         head += [f"{compared} minus it, `{first}`", "p"] * bool(compared) + ["ms a step"]
         lines = [
             [f"*{label}*", "", number(fmean(known)), *[""] * (len(head) - 3)]
-            for label, known in _references(everything).items()
+            for label, known in _references([row for row in everything if row.protocol == first]).items()
         ]
         ranked = sorted(methods, key=lambda name: -self.mean(experiment, environment, name, first))
         against = self._against(experiment, environment, first, compared, ranked)
@@ -414,7 +414,7 @@ def _beside(kind: type[Row], file: Path, name: str) -> list[Row]:
 
 
 def _references(rows: Sequence[RunRow]) -> dict[str, list[float]]:
-    """Returns that methods are compared with, by the words for them; means over all rows that know them."""
+    """Returns that methods are compared with, by the words for them; of all rows that know them."""
     labels = {
         "oracle": "controller that knows the task",
         "behavior": "each task's own best behavior policy",
