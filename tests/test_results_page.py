@@ -204,6 +204,8 @@ def test_a_board_sorts_methods_below_what_they_are_compared_with() -> None:
     )
     assert lines[5].startswith("| A | 5 | 3.00 (1.04 to 4.96) | 2.00 |  |  |")
     assert lines[6].startswith("| blind | 5 | 0.000 (0.000 to 0.000) |  | 3.00 (1.04 to 4.96) | 0.013 |")
+    short = [replace(row, policy_steps=1) if row.method == "blind" else row for row in numbers.rows]
+    assert "| blind (1 steps for the policy) | 5 |" in Numbers(short).board("small", "point-robot")
     in_training = [replace(row, protocol="offline_train", random=-30.0) for row in numbers.rows]
     both = Numbers([*numbers.rows, *in_training])
     assert both.board("small", "point-robot", ["offline"], compared="A").splitlines() == lines

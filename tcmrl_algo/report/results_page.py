@@ -226,6 +226,8 @@ class Numbers:
     ) -> str:
         """All methods of an experiment in an environment, with the returns that one compares them with.
 
+        Methods whose policies had fewer steps than others' say so.
+
         Args:
             protocols: columns; all where empty. Methods are sorted by the first.
             compared: a method whose returns minus each other method's have a column, by the first protocol.
@@ -255,6 +257,8 @@ class Numbers:
             place = (experiment, environment, name)
             rows = self.runs(*place, first)
             label = f"{name} (privileged)" if rows[0].privileged else name
+            if rows[0].policy_steps < max(row.policy_steps for row in everything):
+                label += f" ({rows[0].policy_steps:,} steps for the policy)"
             cells = [label, str(len(rows))]
             cells += [
                 f"{number(self.mean(*place, each))} ({self.interval(*place, each)})" for each in protocols
