@@ -55,7 +55,7 @@ def in_bash(scripts: Path, environment: dict[str, str], *words: str) -> list[str
         ("tcmrl-data export data/point-robot --tier medium-r", ["medium-replay"]),
         ("tcmrl-data export data/point-robot --format hd", ["hdf5"]),
         ("tcmrl train --algo task", ["task_known"]),
-        ("tcmrl evaluate runs/first --protocol off", ["offline"]),
+        ("tcmrl evaluate runs/first --protocol pap", ["paper"]),
         ("tcmrl experiment tou", ["tour"]),
     ],
 )
