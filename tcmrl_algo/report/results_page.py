@@ -47,8 +47,7 @@ class Difference:
     probability: float | None
 
     def __str__(self) -> str:
-        between = "" if self.low is None else f" ({number(self.low)} to {number(self.high)})"
-        return f"{number(self.mean)}{between}"
+        return _with_interval(self.mean, self.low, self.high)
 
 
 @dataclass
@@ -146,7 +145,7 @@ class Numbers:
         place = (experiment, environment, method, protocol)
         shares = [a / b for a, b in zip(self.values(*place), self.values(*place, of), strict=True)]
         low, high = mean_interval(shares, fewest=2) or (None, None)
-        return number(fmean(shares)) + ("" if low is None else f" ({number(low)} to {number(high)})")
+        return _with_interval(fmean(shares), low, high)
 
     def curve_difference(self, experiment: str, environment: str, method: str, other: str) -> Difference:
         """As `difference`, of the means over the points of learning curves: how soon methods learn.
@@ -384,6 +383,10 @@ def number(value: float | None, digits: int = DIGITS) -> str:
         return "–"
     whole = len(str(int(abs(value)))) if abs(value) >= 1 else 0
     return f"{value:,.{max(0, digits - whole)}f}"
+
+
+def _with_interval(mean: float, low: float | None, high: float | None) -> str:
+    return number(mean) + ("" if low is None else f" ({number(low)} to {number(high)})")
 
 
 def percent(share: float | None, places: int = 0) -> str:

@@ -1,7 +1,7 @@
 """The usual protocol of offline meta-RL papers: contexts are stored trajectories of the tasks themselves."""
 
 from collections.abc import Sequence
-from typing import ClassVar, Literal, final
+from typing import final
 
 from tcmrl_algo.evaluation.arena import Arena
 from tcmrl_algo.evaluation.protocols.base import Adaptation, Protocol
@@ -31,4 +31,4 @@ class OfflineTrainProtocol(OfflineProtocol):
     """The same in training tasks: a policy that is no better there than in test tasks is not overfitted."""
 
     name = "offline_train"
-    split: ClassVar[Literal["train", "test"]] = "train"
+    split = "train"
