@@ -36,6 +36,15 @@ def test_steps_are_those_of_torchs_adam_to_the_bit_also_where_a_gradient_is_miss
                 assert torch.equal(adam.tensors()[f"{name}/{moment}"], reference.state[value][moment])
 
 
+def test_the_whole_state_lies_where_the_parameters_do() -> None:
+    """A checkpoint's tensors are looked through together, which a GPU does for its own alone."""
+    bias = torch.nn.Parameter(torch.empty(2, device="meta"))
+    adam = Adam([("bias", bias)], learning_rate=1.0)
+    zeros = torch.zeros(2)
+    adam.load_tensors({"bias/step": torch.tensor(1.0), "bias/exp_avg": zeros, "bias/exp_avg_sq": zeros})
+    assert [value.device for value in adam.tensors().values()] == 3 * [bias.device]
+
+
 def test_gradients_are_bounded_where_asked() -> None:
     layer = torch.nn.Linear(1, 1, bias=False)
     adam = Adam(layer.named_parameters(), learning_rate=1e-3, gradient_norm=0.5)

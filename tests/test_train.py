@@ -50,6 +50,21 @@ def test_one_seed_gives_the_same_parameters_after_40_steps(start: Train, algorit
     assert len(digests) == 2
 
 
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="no CUDA device")
+@pytest.mark.parametrize("algorithm", METHODS.names())
+def test_every_method_trains_and_resumes_on_a_gpu_as_on_the_cpu(
+    start: Train, tiny: Dataset, algorithm: str
+) -> None:
+    runs = [
+        start(device, "run.log_every=1", algorithm=algorithm, steps=2, device=device, seed=3).run.folder
+        for device in ("cpu", "cuda")
+    ]
+    on_cpu, on_gpu = (_metrics(folder)[0] for folder in runs)
+    assert on_gpu.pop("stage") == on_cpu.pop("stage")
+    assert on_gpu == pytest.approx(on_cpu, rel=1e-3, abs=1e-5)
+    assert resume_run(runs[1], tiny, steps=4).step == 4
+
+
 def test_precision_reaches_training_and_keeps_it_repeatable(start: Train) -> None:
     first = start("first", "run.precision=bfloat16", steps=20)
     assert start("second", "run.precision=bfloat16", steps=20).digest == first.digest

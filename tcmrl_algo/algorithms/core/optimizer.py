@@ -98,7 +98,7 @@ class Adam:
         found = {}
         for name, memory in self._memories.items():
             if memory.steps:
-                found[f"{name}/step"] = torch.tensor(float(memory.steps))
+                found[f"{name}/step"] = torch.tensor(float(memory.steps), device=memory.average.device)
                 found[f"{name}/exp_avg"], found[f"{name}/exp_avg_sq"] = memory.average, memory.square
         return found
 
