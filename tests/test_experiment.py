@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
 from tcmrl_cli.train import tcmrl
 
 import tcmrl_data
@@ -18,6 +19,7 @@ from tcmrl_algo.experiment.job import code_commit, run_job
 from tcmrl_algo.experiment.plan import plan_runs, resolve_method
 from tcmrl_algo.experiment.results import RunResult, read_result, read_results
 from tcmrl_algo.experiment.spec import Experiment, read_experiment
+from tcmrl_algo.training.checkpoint import write_run
 from tcmrl_data import SelectionError, TcmrlError, TrainingError
 from tcmrl_data.foundation.machine import available_cores, processor
 from tcmrl_data.foundation.records import read_record
@@ -65,6 +67,22 @@ def test_one_document_per_run_and_one_table(finished: Path, tiny_folder: Path) -
     rows = list(csv.DictReader((finished / "table.csv").read_text().splitlines()))
     assert [row["method"] for row in rows] == ["TCMRL"] * 4 + ["no context"] * 4
     assert float(rows[2]["final"]) == result.evaluations["offline"]["mean_final"]
+
+
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a CUDA device")
+def test_runs_that_a_gpu_trained_are_evaluated_where_there_is_none(
+    small_results: Path, tiny_folder: Path, tmp_path: Path
+) -> None:
+    results = Path(shutil.copytree(small_results, tmp_path / "small"))
+    file = results / "runs/point-robot--tcmrl--seed1.json"
+    before = read_record(RunResult, file)
+    file.unlink()
+    run = open_run(file.with_suffix(""))
+    write_run(run.folder, run.record.model_copy(update={"device": "cuda"}))
+    run_experiment(_small(tiny_folder), results)
+    result = read_record(RunResult, file)
+    assert (result.digest, result.device, result.processor) == (before.digest, "cuda", None)
+    assert result.evaluations == before.evaluations
 
 
 def test_a_second_call_does_nothing_and_says_the_same(

@@ -131,8 +131,15 @@ def _result(
         peak_memory=max(point.device_memory or point.peak_memory for point in curve),
         behavior_seed=dataset.manifest.seed,
         commit=code_commit(),
-        processor=torch.cuda.get_device_name() if run.record.device.startswith("cuda") else processor(),
+        processor=_trained_by(run.record.device),
     )
+
+
+def _trained_by(device: str) -> str | None:
+    """Model name of what trained; None for a graphics card that another machine has."""
+    if not device.startswith("cuda"):
+        return processor()
+    return torch.cuda.get_device_name() if torch.cuda.is_available() else None
 
 
 def code_commit() -> str | None:
