@@ -71,7 +71,7 @@ def draw_finals(file: Path, title: str, results: Sequence[RunResult]) -> None:
             if summary.low is not None and summary.high is not None:
                 axes.vlines(place, summary.low, summary.high, color=color, linewidth=8, alpha=0.3)
         axes.set_xticks(range(len(methods)), list(methods), rotation=30, ha="right", fontsize="small")
-        axes.set(title=f"{title}: {protocol}", ylabel="return on test tasks", xlim=(-0.6, len(methods) - 0.4))
+        axes.set(title=f"{title}: {protocol}", ylabel="return", xlim=(-0.6, len(methods) - 0.4))
     figure.savefig(file, dpi=130)
 
 
@@ -103,7 +103,7 @@ def draw_adaptation(file: Path, title: str, results: Sequence[RunResult]) -> Non
             curves = [run.evaluations[protocol].get("adaptation_curve", []) for run in runs]
             means = [float(np.mean(values)) for values in zip(*curves, strict=False)]
             axes.plot(range(1, len(means) + 1), means, ".-", color=f"C{index % 10}", label=method)
-        axes.set(xlabel="episode", ylabel="return on test tasks", title=f"{title}: {protocol}")
+        axes.set(xlabel="episode", ylabel="return", title=f"{title}: {protocol}")
         axes.legend(fontsize="small")
     figure.savefig(file, dpi=130)
 

@@ -29,16 +29,17 @@ ReportProgress = Callable[[str, int, int], None]
 Draw = Callable[[Path], None]
 
 NOTE = """\
-Returns are undiscounted sums of rewards after adaptation, averaged over the test tasks. Intervals are 95% \
-intervals of the mean over runs by Student's t; with fewer than five runs, the values of all are printed. \
-The column `interval covers` says over what they are taken. Seeds of one split share the dataset, the split \
-and the test tasks: their interval shows the variance of training, and nothing of other tasks or data. \
-With folds, every task of the dataset is a test task once, and the interval is over all pairs of seed and \
-fold: it covers training on these splits, not tasks beyond the dataset. `other context` is the return of the \
-same policy with the contexts of other tasks; the regret is the oracle's return minus the policy's; `best \
-fixed` is the return of the best policy that acts the same in all tasks, fitted on the training tasks; the \
-normalized score is 0 for uniform actions and 1 for the oracle or, without one, for the best behavior \
-policy. A `(privileged)` method is a control that observes the task parameters."""
+Returns are undiscounted sums of rewards after adaptation, averaged over the test tasks, under \
+`offline_train` over training tasks. Intervals are 95% intervals of the mean over runs by Student's t; \
+with fewer than five runs, the values of all are printed. The column `interval covers` says over what they \
+are taken. Seeds of one split share the dataset, the split and the test tasks: their interval shows the \
+variance of training, and nothing of other tasks or data. With folds, every task of the dataset is a test \
+task once, and the interval is over all pairs of seed and fold: it covers training on these splits, not \
+tasks beyond the dataset. `other context` is the return of the same policy with the contexts of other \
+tasks; the regret is the oracle's return minus the policy's; `best fixed` is the return of the best policy \
+that acts the same in all tasks, fitted on the training tasks; the normalized score is 0 for uniform \
+actions and 1 for the oracle or, without one, for the best behavior policy. A `(privileged)` method is a \
+control that observes the task parameters."""
 CLAIMS = """\
 Differences are taken run by run (same seed, same fold), and positive differences support the claim, which \
 is judged under every protocol that it concerns. The 95% interval of the mean difference is by Student's t, \
@@ -49,7 +50,7 @@ With fewer than five runs there is no interval and no verdict. `unequal settings
 share and in which the two compared differ, first and second: where a search found them, a difference may \
 be theirs."""
 ADAPTATION = """\
-Returns of the adaptation episodes of a protocol in turn, means over test tasks and runs. The first episodes \
+Returns of the adaptation episodes of a protocol in turn, means over tasks and runs. The first episodes \
 of `paper` act uniformly, those of the other protocols by stored or tried contexts; where the first stage is \
 random, the protocol was run several times (`repeats` in the JSON documents), and all returns are means."""
 TUNING = """\
